@@ -26,7 +26,7 @@ TASK = "put the red block in the bowl"
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("videos")
     write_video(folder / "success.mp4", make_clip("success", Task("red", "bowl"), 2_000_000).frames)
-    (folder / "tasks.json").write_text(json.dumps({"success.mp4": TASK}))
+    (folder / "tasks.csv").write_text(f"video,task\nsuccess.mp4,{TASK}\n")
     return folder / "success.mp4"
 
 

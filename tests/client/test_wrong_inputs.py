@@ -23,7 +23,7 @@ STARTED = "start the server there (rfm serve), or give the URL of one that runs"
 URL = "expected grpc://host:port or http://host:port, or grpcs:// or https://, got"
 DATASET = (
     "expected a LeRobot dataset (meta/info.json), an RLDS dataset (features.json), an HDF5 file (.hdf5, .h5), a folder "
-    "of videos, of folders of pictures or of .npy and .npz files with tasks.csv or tasks.json, or a Hub id "
+    "of videos, of folders of pictures or of .npy and .npz files with tasks.csv, or a Hub id "
     "org/name[@revision], got"
 )
 PAIR = "expected a certificate and its key (PEM, unencrypted) at"

@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import re
 import shutil
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,7 @@ from PIL import Image
 from hdf5_writers import write_robomimic
 from labelling import LEROBOT, BrightnessScorer, brightness, command
 from paths import ROOT
-from pictures import numbered, write_video
+from pictures import numbered
 from rfm_client.command_line import ExitCode
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset, read_episode_labels
 
@@ -188,7 +186,7 @@ UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, the opened path, the
     "videos of an episode each": (
         ["a/b/episode_000000.mp4"],
         "",
-        "those of one camera in tasks.csv (a/b/episode_000000",
+        "list those of one camera (a/b/episode_000000.mp4) in tasks.csv",
     ),
     "pictures and a video": (
         ["0/1.png", "a.mp4"],
@@ -211,6 +209,11 @@ UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, the opened path, the
         ["a.mp4"],
         "",
         'got none: write it, or, if all of them have one task, give it: --task "SE',
+    ),
+    "a table of before": (
+        ["a.mp4", "tasks.json"],
+        "",
+        "got tasks.json: write it as tasks.csv, with the columns video and",
     ),
     "an empty folder": ([".hidden"], "", "got an empty folder: put a video, an array or a folder of pictures for each"),
     "other files": (["a.txt"], "", "got other files: put a video, an array or a folder of pictures for each episode"),
@@ -245,19 +248,6 @@ def test_files_that_git_cloned_without_git_lfs_are_told(tmp_path: Path, source: 
 def test_what_is_not_there_is_refused(name: str) -> None:
     with pytest.raises(DatasetError, match=f"^{name}: expected a LeRobot dataset .* got none$"):
         open_dataset(name)
-
-
-def test_videos_of_cameras_in_deeper_folders_are_listed_by_the_command_that_is_printed(tmp_path: Path) -> None:
-    """As AgiBot World has them."""
-    for episode in (2, 10):
-        for camera in ("head_color", "hand_left"):
-            (tmp_path / f"a task/{episode}/videos").mkdir(parents=True, exist_ok=True)
-            write_video(tmp_path / f"a task/{episode}/videos/{camera}.mp4", numbered(episode))
-    with pytest.raises(DatasetError, match=r"got videos in deeper folders: list those of one camera: ") as refused:
-        open_dataset(tmp_path, task=TASK)
-    (command,) = re.findall(r"\(cd .* tasks\.csv\)", str(refused.value))
-    subprocess.run(command, shell=True, check=True)
-    assert [episode.num_frames for episode in open_dataset(tmp_path, task=TASK).episodes] == [10, 2]
 
 
 @pytest.mark.parametrize(("files", "opened", "message"), UNREAD.values(), ids=UNREAD)

@@ -15,7 +15,7 @@ import pytest
 
 from client_commands import invoke
 from encoding import encode_here
-from labelling import FRONT, LEROBOT, BrightnessScorer, Notes, change_column
+from labelling import FRONT, LEROBOT, BrightnessScorer, change_column
 from pictures import write_video
 from rfm_client import UInt8Array
 from rfm_client.frames import video_file
@@ -75,7 +75,6 @@ class Recording:
     times: Callable[[int], list[float]] = regular
     frames_a_row: int = 1
     opening: dict[str, Any] = field(default_factory=dict)
-    left_out: int = 0
 
 
 def rows_of(episode: int) -> list[int]:
@@ -91,14 +90,9 @@ RECORDINGS = {
         TAKES_BEHIND,
         starts=[int(STARTS[e]) + sum(TAKES[:e]) for e in EPISODES],
         lasts=[LENGTHS[e] + TAKES[e] for e in EPISODES],
-        left_out=22,
     ),
-    "trimmed episodes": Recording(
-        TRIMMED, starts=[int(STARTS[e]) + sum(TAKES[: e + 1]) for e in EPISODES], left_out=26
-    ),
-    "a row for every second frame": Recording(
-        [number for row in ALL for number in (row, DISCARDED)], frames_a_row=2, left_out=177
-    ),
+    "trimmed episodes": Recording(TRIMMED, starts=[int(STARTS[e]) + sum(TAKES[: e + 1]) for e in EPISODES]),
+    "a row for every second frame": Recording([number for row in ALL for number in (row, DISCARDED)], frames_a_row=2),
     "the times of a clock": Recording(ALL, times=by_a_clock, opening=CLOCK),
     "the times of a clock and discarded takes": Recording(
         TAKES_BEHIND,
@@ -106,7 +100,6 @@ RECORDINGS = {
         lasts=[LENGTHS[e] + TAKES[e] for e in EPISODES],
         times=by_a_clock,
         opening=CLOCK,
-        left_out=22,
     ),
     "last rows that are late": Recording(ALL, times=with_a_late_end, opening={"tolerance_s": 0.03}),
 }
@@ -136,14 +129,10 @@ def options(output: Path, **more: Any) -> LabelOptions:
 
 @pytest.mark.parametrize("recording", RECORDINGS.values(), ids=RECORDINGS)
 def test_each_row_has_the_frame_at_its_time(tmp_path: Path, output: Path, recording: Recording) -> None:
-    dataset, notes = open_dataset(written(tmp_path, recording), **recording.opening), Notes()
-    report = label(dataset, BrightnessScorer(), options(output), notes)
-    assert not report.failures
+    dataset = open_dataset(written(tmp_path, recording), **recording.opening)
+    assert not label(dataset, BrightnessScorer(), options(output)).failures
     for number in EPISODES:
         assert shown(list(dataset.frames(dataset.episode(number), FRONT))) == rows_of(number)
-    told = [line for line in notes.lines if line.startswith("left out: ")]
-    of_all = f"{recording.left_out} of the {len(recording.film)} frames in 1 videos ({VIDEO})"
-    assert told == [f"left out: {FRONT}: {of_all}, because no row has their times"] * bool(recording.left_out)
 
 
 def test_a_row_that_is_further_from_its_frame_than_lerobot_allows_is_refused_with_the_option(

@@ -63,32 +63,24 @@ def label(dataset: Dataset, scorer: Scorer, options: LabelOptions = DEFAULTS, wa
     Raises DatasetError, before the first score, for a contradictory dataset or a label file that this run may not
     replace; RewardError if the scorer is gone; OSError for a full disk.
     """
-    outputs, plan, earlier = prepared(dataset, scorer, options, watch)
+    outputs = Outputs.of(dataset, options)
+    plan = planned(dataset, scorer, outputs, watch, writes=True)
     run = Run(plan, dataset, scorer, outputs.parts, watch)
     failures = run.finish_all(options.workers)
-    return put_together(plan, dataset, outputs, failures, run.cost or earlier, watch)
+    return put_together(plan, dataset, outputs, failures, run.cost, watch)
 
 
-def prepared(
-    dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch
-) -> tuple[Outputs, Plan, Cost | None]:
-    """Make and check the plan. Return the cost of these labels in existing files, too; None: unknown."""
-    outputs = Outputs.of(dataset, options)
-    if options.shard is None:
-        outputs.make_folder()
-    plan = plan_labels(dataset, scorer, options, watch)
-    check(plan, dataset, outputs, watch)
-    digests = {item.digest for item in plan.items}  # labels of another recipe have other digests
-    known = (file.cost for file in outputs.before() if digests & set(file.digests.values()))
-    return outputs, plan, next(filter(None, known), None)
+def planned(dataset: Dataset, scorer: Scorer, outputs: Outputs, watch: Watch = QUIET, *, writes: bool = False) -> Plan:
+    """Return the plan, once all that the run needs before the first score is checked.
 
-
-def check(plan: Plan, dataset: Dataset, outputs: Outputs, watch: Watch = QUIET) -> int:
-    """Check everything that a run needs before the first score, write nothing, and return the bytes to decode.
+    writes: True: make the folder for the label files
 
     Raises DatasetError, also for existing label files that this run may not replace.
     """
     options = outputs.options
+    if writes and options.shard is None:
+        outputs.make_folder()
+    plan = plan_labels(dataset, scorer, options, watch)
     for file in outputs.before() if options.shard is None else ():
         try:
             file.check(plan)
@@ -99,14 +91,12 @@ def check(plan: Plan, dataset: Dataset, outputs: Outputs, watch: Watch = QUIET) 
             labels = f"its labels of {len(file.digests)} episodes are" if file.digests else "it is"
             watch.note(f"--overwrite: {error}; {labels} replaced")
     watch.checking(len(plan.items))
-    num_bytes = 0
     with all_faults(dataset, options):
         for item in plan.items:
-            num_bytes += sum(dataset.check(item.episode, camera) for camera in plan.recipe.decoded_cameras)
+            for camera in plan.recipe.decoded_cameras:
+                dataset.check(item.episode, camera)
             watch.checked(item.episode)
-    for line in dataset.frame_notes:
-        watch.note(line)
-    return num_bytes
+    return plan
 
 
 def put_together(
@@ -117,7 +107,10 @@ def put_together(
     cost: Cost | None,
     watch: Watch,
 ) -> Report:
-    """Write the label files, unless an episode failed or the run labelled only a shard."""
+    """Write the label files, unless an episode failed or the run labelled only a shard.
+
+    cost: of this run; None: it scored nothing, or does not know, and the cost in existing files holds
+    """
     report = Report([], failures, outputs.parts.url, None, plan)
     if failures or outputs.options.shard is not None:
         return report
@@ -125,7 +118,7 @@ def put_together(
     blank = blank_from_metadata(labels.schema.metadata)
     for line in blank_lines(blank, len(plan.items)):
         watch.note(line)
-    files = outputs.write(plan, labels, cost)
+    files = outputs.write(plan, labels, cost or outputs.earlier_cost(plan))
     for name, score in SCORES.items():
         if name in labels.column_names and (told := score.told(labels[name].to_numpy())):
             watch.note(f"{told}; the column {name} marks them")
@@ -188,6 +181,12 @@ class Outputs:
         named = zip(self.progress, ("--name", "--alias"), strict=False)
         found = [LabelFile.read(path, option) for path, option in named if path.exists()]
         return found + [LabelFile.read(path) for path in self.signals if path.exists()]
+
+    def earlier_cost(self, plan: Plan) -> Cost | None:
+        """Return the cost of these labels in existing files; None: unknown."""
+        digests = {item.digest for item in plan.items}  # labels of another recipe have other digests
+        known = (file.cost for file in self.before() if digests & set(file.digests.values()))
+        return next(filter(None, known), None)
 
     def write(self, plan: Plan, labels: Any, cost: Cost | None) -> list[Path]:
         """Write the labels to all files, and return their paths. Raises OSError.

@@ -8,23 +8,53 @@ import itertools
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any, get_args
 
-from rfm_client import InvalidSampleError, RewardError
-from rfm_client.frames import ChannelOrder, Correction, Fuse, Orientation, Sampling
+from rfm_client import InvalidSampleError, RewardError, UInt8Array
+from rfm_client.frames import ChannelOrder, Correction, FrameFileError, Fuse, Orientation, Picture, Sampling
 from rfm_client.options import InvalidValueError, first_names
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.datasets.faults import FaultsError, listed, require
 from rfm_labels.datasets.stored_files import digest_of
-from rfm_labels.goal import Goal
-from rfm_labels.options import QUIET, LabelOptions, Mode, ProgressRule, Watch, chosen_numbers
+from rfm_labels.options import LAST, QUIET, LabelOptions, Mode, ProgressRule, Watch, chosen_numbers
 from rfm_labels.scorer import CheckpointFacts, Scorer
 
 _RECIPE_FORMAT = 4  # increased when the same recipe gives other scores or other digests
 _OPTIONAL = ("progress_rule",)  # labels made before have no such field
 _OF_TRAINING = {True: "as upstream's training pads shorter clips", False: "the checkpoint's training did not pad"}
 _OF_CHECKPOINT = "the most in training; if the checkpoint does not say, the most its network takes"
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A picture of the task done. name: of its file, or ``last``; content: of the file; empty: the last frame"""
+
+    name: str
+    content: bytes = field(default=b"", repr=False)
+
+    @classmethod
+    def of(cls, given: str) -> Goal:
+        """Return the goal of an option. Raises InvalidSampleError for a file that is no picture."""
+        if given == LAST:
+            return cls(given)
+        try:
+            goal = cls(Path(given).name, Path(given).read_bytes())
+            Picture(goal.content).pixels()
+        except FrameFileError as error:
+            raise InvalidSampleError.like(error, where="goal") from error
+        except OSError as error:
+            raise InvalidSampleError.at("goal", f"a picture, or {LAST}", error) from error
+        return goal
+
+    def picture(self, frames: UInt8Array) -> UInt8Array:
+        """Return the picture, uint8 [H, W, 3], for these frames, uint8 [T, H, W, 3]."""
+        return Picture(self.content).pixels() if self.content else frames[-1]
+
+    def document(self) -> dict[str, str]:
+        """Return the goal as it stands in the provenance."""
+        return {"picture": self.name, **({"digest": digest_of([self.content])} if self.content else {})}
 
 
 @dataclass(frozen=True)

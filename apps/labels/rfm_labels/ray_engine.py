@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 
 from rfm_client import RewardError
 from rfm_labels.datasets.opening import open_dataset
-from rfm_labels.labelling import Report, prepared, put_together
+from rfm_labels.labelling import Outputs, Report, planned, put_together
 from rfm_labels.options import DEFAULTS, QUIET, LabelOptions, RayOptions, Watch
 from rfm_labels.plan import Plan
 from rfm_labels.scorer import Scorer
@@ -133,7 +133,8 @@ def label_with_ray(
     """
     dataset = open_dataset(source, **opening)
     with connect() as scorer:
-        outputs, plan, earlier = prepared(dataset, scorer, options, watch)
+        outputs = Outputs.of(dataset, options)
+        plan = planned(dataset, scorer, outputs, watch, writes=True)
     job = RayJob(source, opening, connect, plan, outputs.parts.url, options.workers)
     failures = finish_all_with_ray(job, ray, watch)
-    return put_together(plan, dataset, outputs, failures, earlier, watch)
+    return put_together(plan, dataset, outputs, failures, None, watch)

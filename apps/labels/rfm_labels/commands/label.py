@@ -4,13 +4,11 @@
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias, get_args
 
 import typer
 
@@ -18,36 +16,102 @@ from rfm_client import RewardError
 from rfm_client.command_line import ExitCode, ServerOptions, print_table, report, with_options
 from rfm_client.frames import ChannelOrder, Orientation
 from rfm_client.options import ConfigError, Settings, setting
-from rfm_labels.commands.progress_bar import ProgressBar, Say
-from rfm_labels.datasets.cameras import parsed_by_camera
-from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset, SeveralTasks
+from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset, DatasetEpisode, SeveralTasks, parsed_by_camera
 from rfm_labels.datasets.faults import FaultsError, UnusedTaskError, listed, require
 from rfm_labels.datasets.hdf5 import label_prefix
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
 from rfm_labels.datasets.opening import hdf5_files, open_dataset
 from rfm_labels.label_files import read_blank
-from rfm_labels.labelling import Outputs, Report, check
+from rfm_labels.labelling import Outputs, Report, planned
 from rfm_labels.labelling import label as label_dataset
-from rfm_labels.metadata import blank_by_camera, blank_lines
+from rfm_labels.metadata import blank_lines
 from rfm_labels.options import LabelOptions, RayOptions, Watch
-from rfm_labels.plan import Item, Plan, check_episodes, plan_labels, selected
+from rfm_labels.plan import check_episodes, selected
 from rfm_labels.ray_engine import Connect, label_with_ray
 from rfm_labels.scorer import ClientScorer, Scorer
-from rfm_labels.scoring import FrameMemory, episode_scores
 from rfm_labels.summary import Summary, summarise
-from rfm_labels.writing import Parts
 
-_MIB = 2**20
+SPEED_OVER_S = 600.0  # an episode may take minutes
+Say: TypeAlias = Callable[[str], None]
 _OF_CAMERAS = ("orient", "channels")  # options with a value for each camera
-
 DatasetArgument = Annotated[
     str,
     typer.Argument(
         metavar="DATASET",
         help="LeRobot folder or Hub id org/name@revision; HDF5 file, or a folder of them; RLDS folder; folder of "
-        "videos, of folders of pictures, or of .npy and .npz files, with tasks.csv or tasks.json.",
+        "videos, of folders of pictures, or of .npy and .npz files, with tasks.csv.",
     ),
 ]
+
+
+class ProgressBar(Watch):
+    """Lines on standard error and, on a terminal, a bar with frames a second and the time left."""
+
+    def __init__(self, say: Say) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn, TimeRemainingColumn
+        from rich.text import Text
+
+        class Rate(TextColumn):
+            def render(self, task: Task) -> Text:
+                return Text(f"{task.speed:.1f}/s" if task.speed else "")
+
+        console = Console(stderr=True)
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Rate(""), TimeRemainingColumn())
+        self._say = say
+        self._bar = Progress(
+            *columns,
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+            speed_estimate_period=SPEED_OVER_S,
+        )
+        self.num_begun = 0
+
+    def __enter__(self) -> ProgressBar:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def note(self, text: str) -> None:
+        """Write the text on a line."""
+        self._say(f"note: {text}")
+
+    def checking(self, num_episodes: int) -> None:
+        """Begin to count checked episodes."""
+        self._begin("checking episodes", num_episodes, 0)
+
+    def checked(self, episode: DatasetEpisode) -> None:
+        """Advance the bar by an episode."""
+        self._advance(1)
+
+    def begin(self, num_frames: int, num_finished: int) -> None:
+        """Begin to count labelled frames."""
+        if num_finished:
+            self.note(f"{num_finished} of {num_frames} frames are labelled already")
+        self.num_begun = num_frames
+        self._begin("labelling frames", num_frames, num_finished)
+
+    def scored(self, episode: DatasetEpisode) -> None:
+        """Advance the bar by the episode's frames."""
+        self._advance(episode.num_frames)
+
+    def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
+        """Write a line with the reason."""
+        text = str(error)
+        self._say(text if text.startswith(episode.name) else f"{episode.name}: {text}")
+        self._advance(episode.num_frames)
+
+    def _begin(self, text: str, total: int, completed: int) -> None:
+        for task in self._bar.task_ids:
+            self._bar.remove_task(task)
+        self._bar.add_task(text, total=total, completed=completed)
+
+    def _advance(self, by: int) -> None:
+        for task in self._bar.task_ids:
+            self._bar.advance(task, by)
 
 
 @dataclass(frozen=True)
@@ -108,14 +172,9 @@ class RunOptions(Settings):
     TITLE: ClassVar[str] = "Run"
 
     engine: Literal["threads", "ray"] = setting("threads", "threads: in this process. ray: by actors of a Ray cluster.")
-    dry_run: bool = setting(False, "Check everything, measure a few episodes, write nothing.")
+    dry_run: bool = setting(False, "Check everything, count, write nothing.")
     report: bool = setting(False, "Only show the summary of labels that are there.")
     picture: bool = setting(True, "Draw the summary: NAME_summary.png in the output.")
-    rrd: Path | None = setting(
-        None,
-        "Record frames and scores of each labelled episode for Rerun's viewer: a .rrd file each.",
-        metavar="FOLDER",
-    )
 
 
 @with_options
@@ -173,16 +232,7 @@ class LabelCommand:
         if self.options.dry_run:
             self._try()
             return ExitCode.OK
-        if self.options.rrd is not None:
-            from rfm_client.recording import Recording
-
-            Recording(self.options.rrd)  # a missing package must not fail after the labelling
-            self.options.rrd.mkdir(parents=True, exist_ok=True)
-        report = self._label()
-        status = self._tell(report)
-        if self.options.rrd is not None:
-            self._record(self.options.rrd, report)
-        return status
+        return self._tell(self._label())
 
     def _run_each(self, files: Sequence[Path]) -> ExitCode:
         """Run for each HDF5 file of a folder, once all can be opened. Raises DatasetError for a file that cannot."""
@@ -191,10 +241,7 @@ class LabelCommand:
         got = f"{', '.join(twice)}: leave out --output, and labels lie beside their files"
         has_room = self.labels.output is None or not twice
         require("output", has_room, "a folder for files whose names differ", got)
-        commands = []
-        for file in files:
-            rrd = self.options.rrd and self.options.rrd / file.stem
-            commands.append(replace(self, source=str(file), options=replace(self.options, rrd=rrd)))
+        commands = [replace(self, source=str(file)) for file in files]
         codes = []
         for command in commands if self.options.report else self._checked(commands):
             self.say(f"{command.source}")
@@ -241,14 +288,20 @@ class LabelCommand:
             raise
 
     def _try(self) -> None:
-        """Check everything, measure a few episodes, write nothing."""
+        """Check everything, write nothing."""
         dataset = self._dataset()
-        outputs = Outputs.of(dataset, self.labels)
         with self.connect() as scorer, ProgressBar(self.say) as watch:
-            plan = plan_labels(dataset, scorer, self.labels, watch)
-            num_bytes = check(plan, dataset, outputs, watch)
-            took_s = _measured_s(plan, dataset, scorer, self.labels.workers, watch)
-        _print(_plan_rows(plan, dataset, num_bytes, took_s))
+            plan = planned(dataset, scorer, Outputs.of(dataset, self.labels), watch)
+        tasks = sorted({task for item in plan.items for task, _ in item.episode.stretches})
+        cameras = plan.recipe.decoded_cameras
+        decoded = f"of {len(cameras)} cameras: {plan.num_frames * len(cameras)} to be decoded"
+        rows = [
+            ("dataset", f"{dataset.kind}: {dataset.source}" + (f"@{dataset.revision}" if dataset.revision else "")),
+            ("episodes", str(len(plan.items))),
+            ("frames", f"{plan.num_frames}, {decoded}"),
+            (f"tasks: {len(tasks)}", "; ".join(tasks[:5]) + (" ..." if len(tasks) > 5 else "")),
+        ]
+        _print(rows)
 
     def _tell(self, report: Report) -> ExitCode:
         if report.failures:
@@ -266,12 +319,6 @@ class LabelCommand:
         for file in report.files:
             typer.echo(f"{file}")
         return ExitCode.OK
-
-    def _record(self, folder: Path, report: Report) -> None:
-        from rfm_labels.pictures import record_episodes
-
-        for file in record_episodes(folder, self._dataset(), report.plan, Parts(report.parts)):
-            typer.echo(f"{file}")
 
     def _report(self) -> None:
         """Show the summary of existing labels; the source is a dataset or a label file."""
@@ -299,38 +346,6 @@ class LabelCommand:
 
     def _dataset(self) -> Dataset:
         return open_dataset(self.source, **self.texts.opening)
-
-
-def _measured_s(plan: Plan, dataset: Dataset, scorer: Scorer, workers: int, watch: Watch) -> float:
-    """Estimate of the plan's time, from its first ``workers`` episodes. ``watch`` gets a line per blank camera."""
-    first = plan.items[:workers]
-    memory = FrameMemory()
-
-    def score(item: Item) -> tuple[int, Mapping[str, int]]:
-        told = episode_scores(dataset, item.episode, scorer, plan.recipe, memory=memory, go_on=lambda: None)
-        return item.episode.index, told.blank
-
-    score(first[0])  # without the clock: the first call has costs of its own
-    began_s = time.monotonic()
-    with ThreadPoolExecutor(workers) as pool:
-        blank = list(pool.map(score, first))
-    took_s = time.monotonic() - began_s
-    for line in blank_lines(blank_by_camera(blank), len(first)):
-        watch.note(line)
-    return took_s * plan.num_frames / sum(item.episode.num_frames for item in first)
-
-
-def _plan_rows(plan: Plan, dataset: Dataset, num_bytes: int, took_s: float) -> list[tuple[str, str]]:
-    tasks = sorted({task for item in plan.items for task, _ in item.episode.stretches})
-    cameras = plan.recipe.decoded_cameras
-    return [
-        ("dataset", f"{dataset.kind}: {dataset.source}" + (f"@{dataset.revision}" if dataset.revision else "")),
-        ("episodes", str(len(plan.items))),
-        ("frames", f"{plan.num_frames}, of {len(cameras)} cameras: {plan.num_frames * len(cameras)} to be decoded"),
-        ("to be decoded", f"{num_bytes / _MIB:.1f} MiB"),
-        (f"tasks: {len(tasks)}", "; ".join(tasks[:5]) + (" ..." if len(tasks) > 5 else "")),
-        ("it will take about", f"{took_s:.0f} s"),
-    ]
 
 
 def _print(rows: Sequence[tuple[str, str]]) -> None:

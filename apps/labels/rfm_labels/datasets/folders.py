@@ -1,35 +1,124 @@
 # SPDX-License-Identifier: MIT
 """A folder with a video, a file of arrays, a folder of pictures (2.png before 10.png) or a recording for each episode.
 
-A table of tasks (``task_tables``) orders the episodes. Without a table, the caller names the task, and the order is
-that of the names, with 2 before 10. Videos need PyAV, pictures Pillow.
+A table of tasks (``opening``) orders the episodes. Without a table, the caller names the task, and the order is that of
+the names, with 2 before 10. Videos need PyAV, pictures Pillow.
+
+The numbers in file names order the pictures of an episode: counts or times (``-1``, ``0.25``, ``2e-05``). In a pattern
+of names, ``*`` stands for a number: ``*_color_0.jpg``.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from abc import abstractmethod
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from decimal import Decimal
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 from rfm_client import InvalidSampleError, RewardError, Trajectory, UInt8Array, load_trajectory
 from rfm_client.frames import Picture, Video
-from rfm_labels.datasets.cameras import AskedCorrections
-from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
+from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, require
-from rfm_labels.datasets.frame_names import in_order_of_numbers, is_pattern, matching
 from rfm_labels.datasets.stored_files import Span, digest_of, faults_at, file_identity, turn_mark
 
+_NOT_IN_A_WORD = r"(?<![^\W_])"  # behind a letter or a digit, - and . separate: frame-1.png, frame.1.png, 2026-11-26
+_NUMBER = re.compile(
+    rf"((?:{_NOT_IN_A_WORD}-)?"
+    rf"(?:(?<!\d\.)\d+\.\d+(?!\.?\d)|{_NOT_IN_A_WORD}\.\d+|\d+)"  # 1.2.10 has no decimals
+    r"(?:[eE][+-]\d+(?![^\W_]))?)"
+)
+_LETTERS = 2  # minimum letters of a word before a camera number; a time may hold one letter, as in 20261126T123000
+_EXAMPLES = 3  # kinds of names in a message
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
-
 _FILES_AT_A_TIME = 4
 _LEAVE_OUT = "leave it out (--episodes)"
 _UNITREE_FILE, _UNITREE_FOLDER = "data.json", "colors"
+
+
+def is_pattern(path: Path) -> bool:
+    """True if the last part of a path is a pattern of file names."""
+    return "*" in path.name
+
+
+def matching(pattern: str, files: Sequence[str]) -> list[str]:
+    """Return the file names that a pattern stands for."""
+    name = re.compile(_NUMBER.pattern.join(map(re.escape, pattern.split("*"))))
+    return list(filter(name.fullmatch, files))
+
+
+@dataclass(frozen=True)
+class _Name:
+    """A file name split into text and numbers. words: the texts, one more than numbers, and the format"""
+
+    file: str
+    words: tuple[str, ...]
+    digits: tuple[str, ...]
+    numbers: tuple[Decimal, ...]
+
+    @classmethod
+    def of(cls, file: str) -> _Name:
+        parts = _NUMBER.split(Path(file).stem)
+        digits = tuple(parts[1::2])
+        form = Path(file).suffix.lower().replace("jpeg", "jpg")
+        return cls(file, (*parts[::2], form), digits, tuple(map(Decimal, digits)))
+
+    def kind(self, place: int | None) -> str:
+        """The name with ``*`` for all numbers but the one at ``place``."""
+        shown = ["*" if number != place else digits for number, digits in enumerate(self.digits)]
+        parts = [self.words[0], *(part for pair in zip(shown, self.words[1:-1], strict=True) for part in pair)]
+        return "".join(parts) + Path(self.file).suffix
+
+
+def in_order_of_numbers(folder: Path, files: Sequence[str]) -> list[str]:
+    """Return an episode's file names in order.
+
+    Raises DatasetError for several kinds of names, such as those of several cameras, or for a repeated number.
+    """
+    names = sorted(map(_Name.of, files), key=lambda name: (name.numbers, name.file))
+    if len({name.words for name in names}) > 1:
+        raise _several_kinds(folder, names, None)
+    for before, name in itertools.pairwise(names):
+        got = f"{before.file} and {name.file}: leave the episode out (--episodes)"
+        require(folder, before.numbers != name.numbers, "each number once", got)
+    places = range(len(names[0].numbers)) if names else ()
+    num_cameras = {place: _num_cameras(names, place) for place in places}
+    of_cameras = [place for place in places if num_cameras[place]]
+    if of_cameras:
+        raise _several_kinds(folder, names, min(of_cameras, key=lambda place: num_cameras[place]))
+    return [name.file for name in names]
+
+
+def _num_cameras(names: Sequence[_Name], place: int) -> int:
+    """Number of cameras that the numbers at a place count; 0 if they count frames.
+
+    Cameras have the same frames, so names repeat without a camera number. Times such as ``12_500`` (s, ms) may repeat
+    by chance, so either all names must repeat, or the number must belong to a word, as in ``cam1_0001``.
+    """
+    others = Counter(name.numbers[:place] + name.numbers[place + 1 :] for name in names)
+    values = {name.numbers[place] for name in names}
+    word = names[0].words[place][-_LETTERS:]
+    is_in_word = len(word) == _LETTERS and word.isalpha()
+    repeats = 1 < len(others) < len(names)
+    return len(values) if repeats and (is_in_word or len(others) * len(values) == len(names)) else 0
+
+
+def _several_kinds(folder: Path, names: Sequence[_Name], place: int | None) -> DatasetError:
+    """The error for several kinds of names."""
+    kinds: Mapping[str, int] = Counter(name.kind(place) for name in names)
+    shortest = sorted(kinds, key=lambda kind: (len(kind), kind))
+    told = " and ".join(f"{kind} ({kinds[kind]})" for kind in shortest[:_EXAMPLES])
+    if max(kinds.values()) == 1:
+        remedy = "copy them to a folder of their own, as 0.png and 1.png"
+        return DatasetError.at(folder, "names that differ in a number", f"{told}: {remedy}")
+    got = f"{told}: list those of one camera in tasks.csv, as {folder.name}/{shortest[0]}"
+    return DatasetError.at(folder, "pictures of one camera, whose names differ in a number", got)
 
 
 @dataclass(frozen=True)
@@ -42,7 +131,7 @@ class Contents:
     """
 
     root: Path
-    tasks: Mapping[str, Any]
+    tasks: Mapping[str, str | None]
     table: Path
     task: TaskOverride
     corrections: AskedCorrections
@@ -69,7 +158,7 @@ class EpisodeFiles(Dataset):
         num_frames = self._length(name)
         while len(self._firsts) <= number:
             self._firsts.append(self._firsts[-1] + self._length_or_0(self._names[len(self._firsts) - 1]))
-        return DatasetEpisode(number, name, one_line(task), num_frames, self._firsts[number])
+        return DatasetEpisode(number, name, " ".join(task.split()), num_frames, self._firsts[number])
 
     def _length(self, name: str) -> int:
         if name not in self._lengths:
@@ -95,7 +184,7 @@ class EpisodeFiles(Dataset):
 def in_natural_order(names: Iterable[str]) -> list[str]:
     """Return names of episodes, sorted with their numbers as integers: ``2`` before ``10``, ``1.2`` before ``1.10``.
 
-    ``frame_names`` orders frames, whose numbers may be times.
+    ``in_order_of_numbers`` orders frames, whose numbers may be times.
     """
 
     def key(name: str) -> tuple[list[tuple[int, str]], str]:
@@ -103,11 +192,6 @@ def in_natural_order(names: Iterable[str]) -> list[str]:
         return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts], name
 
     return sorted(names, key=key)
-
-
-def one_line(task: Any) -> Any:
-    """Return a task with each run of spaces and line breaks as one space, and none at the ends."""
-    return " ".join(task.split()) if isinstance(task, str) else task
 
 
 class VideoFolder(EpisodeFiles):
@@ -135,11 +219,8 @@ class VideoFolder(EpisodeFiles):
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
         return file_identity(self.root / episode.name, verify=verify)
 
-    def check(self, episode: DatasetEpisode, camera: str) -> int:
-        self.chosen_cameras([camera])
-        file = self.root / episode.name
-        with faults_at(file):
-            return sum(self._videos(file).packets.num_bytes)
+    def check(self, episode: DatasetEpisode, camera: str) -> None:
+        self._length(episode.name)  # finds all packets
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         file = self.root / episode.name
@@ -173,11 +254,10 @@ class ArrayFiles(EpisodeFiles):
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
         return file_identity(self.root / episode.name, verify=verify)
 
-    def check(self, episode: DatasetEpisode, camera: str) -> int:
+    def check(self, episode: DatasetEpisode, camera: str) -> None:
         file = self.root / episode.name
-        frames = _frames(file)
-        require(file, len(frames) == episode.num_frames, f"{episode.num_frames} frames", len(frames))
-        return int(frames.nbytes)
+        num_frames = len(_frames(file))
+        require(file, num_frames == episode.num_frames, f"{episode.num_frames} frames", num_frames)
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         return iter(_frames(self.root / episode.name))
@@ -227,13 +307,10 @@ class FrameFolders(EpisodeFiles):
         stored = ((file, file_identity(file, verify=verify)) for file in files)
         return digest_of(f"{file.name} {identity}{turn_mark(file)}".encode() for file, identity in stored)
 
-    def check(self, episode: DatasetEpisode, camera: str) -> int:
-        num_bytes = 0
+    def check(self, episode: DatasetEpisode, camera: str) -> None:
         for file in self._files(episode, camera):
             with faults_at(file):
                 Picture(file).check()
-            num_bytes += file.stat().st_size
-        return num_bytes
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         for file in self._files(episode, camera):

@@ -16,24 +16,26 @@ from typing import Any, NoReturn
 
 from rfm_client import RewardError, UInt8Array
 from rfm_client.frames import Orientation, Picture
-from rfm_client.options import first_names
-from rfm_labels.datasets.cameras import AskedCorrections
-from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
+from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, FaultsError, require
-from rfm_labels.datasets.hdf5_contents import (
+from rfm_labels.datasets.hdf5_layouts import (
     DOCUMENTS,
+    ROBOMIMIC,
+    ROBOTWIN,
     attribute,
     filter_keys,
     fps_of,
+    instructions_of,
     is_of_libero,
-    lacking,
+    layout_of,
     opened_hdf5,
     own_task_of,
+    task_in,
     task_of,
+    task_places,
     unread,
     unread_documents,
 )
-from rfm_labels.datasets.hdf5_layouts import ROBOMIMIC, ROBOTWIN, instructions_of, layout_of, task_in, task_places
 from rfm_labels.datasets.hdf5_pictures import (
     EncodedFrames,
     fault_of,
@@ -97,7 +99,7 @@ class Hdf5Dataset(Dataset):
             }
             self._broken = unread_documents(attributes)
             others = unread(opened, self._demos.values()) if self._layout.is_in_data else []
-            notes = [*others, *notes, *_notes_on_lengths(demos, self._lengths, self._layout.skipped)]
+            notes = [*others, *notes]
             notes += [
                 f"data: {name} is not a JSON object, so it states neither a task nor LIBERO" for name in self._broken
             ]
@@ -204,11 +206,10 @@ class Hdf5Dataset(Dataset):
                 return digest_of(encoded.files())
         return digest_of(frame.tobytes() for frame in self.stored_frames(episode, camera))
 
-    def check(self, episode: DatasetEpisode, camera: str) -> int:
+    def check(self, episode: DatasetEpisode, camera: str) -> None:
         with opened_hdf5(self.file) as opened:
-            video = self._video(opened, episode, camera)
-            encoded = self._encoded(video, episode, camera)
-            return int(video.nbytes) if encoded is None else encoded.check()
+            if encoded := self._encoded(self._video(opened, episode, camera), episode, camera):
+                encoded.check()
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         with opened_hdf5(self.file) as opened:
@@ -236,8 +237,6 @@ class Hdf5Dataset(Dataset):
         is_video = is_whole and len(video) == num_pictures
         got = "none" if video is None else form_of(video)
         require(self._where(episode, camera), is_video, f"uint8 [{num_pictures}, H, W, 3]", got)
-        lacks = lacking(video)
-        require(self._where(episode, camera), not lacks, f"{lacks}, a source of this virtual dataset", "none")
         return video
 
     def _where(self, episode: DatasetEpisode, camera: str) -> str:
@@ -252,23 +251,6 @@ def _one_length(lengths: Mapping[str, int]) -> int:
     of_cameras = {length for key, length in lengths.items() if key != _ACTIONS}
     length = of_cameras.pop() if len(of_cameras) == 1 else 0
     return length if lengths.get(_ACTIONS, length) in (length, length - 1) else 0
-
-
-def _notes_on_lengths(
-    demos: Mapping[int, tuple[str, Any]], lengths: Mapping[int, Mapping[str, int]], skipped: int
-) -> list[str]:
-    """Notes on demonstrations with more frames than actions, or another length than ``num_samples``."""
-    longer, others = [], []
-    for number, (name, demo) in demos.items():
-        length = _one_length(lengths[number])
-        if length and lengths[number].get(_ACTIONS, length) < length:
-            longer.append(name)
-        told = attribute(demo.attrs, "num_samples") if length else None
-        if told is not None and told - skipped not in lengths[number].values():
-            others.append(f"{name} ({told}, has {length})")
-    every = "each observation gets a label"
-    notes = [f"lengths: {first_names(longer)}: one observation more than actions: {every}"] if longer else []
-    return notes + ([f"lengths: num_samples differs: {first_names(others)}: {every}"] if others else [])
 
 
 def _notes(untold: Sequence[str], is_libero: bool) -> Sequence[str]:

@@ -14,9 +14,9 @@ import numpy as np
 
 from rfm_client import UInt8Array
 from rfm_client.frames import Picture
-from rfm_labels.datasets.cameras import LEAST_SIZE_PX
+from rfm_labels.datasets.dataset import LEAST_SIZE_PX
 from rfm_labels.datasets.faults import require
-from rfm_labels.datasets.hdf5_contents import members_of
+from rfm_labels.datasets.hdf5_layouts import members_of
 from rfm_labels.datasets.stored_files import faults_at
 
 _STARTS = (b"\xff\xd8\xff", b"\x89PNG")  # first bytes of JPEG and PNG
@@ -40,11 +40,10 @@ class EncodedFrames:
         for t in range(len(self._stored)):
             yield np.asarray(self._stored[t]).tobytes()
 
-    def check(self) -> int:
-        """Return the size of all files in bytes. Raises DatasetError for a frame that is no picture by its header."""
-        num_bytes, marked = 0, []
+    def check(self) -> None:
+        """Raise DatasetError for a frame that is no picture by its header."""
+        marked = []
         for t, file in enumerate(self.files()):
-            num_bytes += len(file)
             if self._raw_size(file) is None:
                 self._require_end(t, file)
                 with faults_at(self._at(t)):
@@ -52,7 +51,6 @@ class EncodedFrames:
                 marked.append(has_rgb_mark(file))
         got = "both: write the episode again"
         require(self._where, len(set(marked)) < 2, "JPEG files all with RoboTwin's mark of RGB, or all without", got)
-        return num_bytes
 
     def pixels(self) -> Iterator[UInt8Array]:
         """Yield the T frames, uint8 [H, W, 3]. Raises DatasetError with the frame."""
@@ -121,6 +119,8 @@ def fault_of(value: Any, are_pictures: bool) -> str:
     """
     if not hasattr(value, "shape"):
         return "a group: expected its pictures one level up"
+    if value.is_virtual:  # h5py would show zeros in place of frames that are missing in another file
+        return "a virtual dataset: copy its frames into the file"
     if is_encoded(value, are_pictures):
         return ""
     shape = value.shape if len(value.shape) == 4 else (0, 0, 0, 0)

@@ -15,9 +15,8 @@ from typing import Any
 
 from rfm_client import UInt8Array
 from rfm_client.frames import Picture, Video
-from rfm_client.options import InvalidValueError, checked_finite, first_names
-from rfm_labels.datasets.cameras import AskedCorrections
-from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
+from rfm_client.options import InvalidValueError, checked_finite
+from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, listed, require
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S, Frames, Part, VideoRows
 from rfm_labels.datasets.lerobot_meta import (
@@ -75,7 +74,6 @@ class LeRobotDataset(Dataset):
         self._rows = RowReader(root / "data", self._sentences(), task)
         self._rows_in = lru_cache(max(_VIDEOS_AT_A_TIME, len(info.videos)))(self._read_video)
         self._clocks: dict[int, str] = {}  # of the episodes that are read
-        self._without_rows: dict[str, dict[Path, tuple[int, int]]] = {}  # frames without rows, all frames
         numbers = Counter(number for number, _ in entries)
         twice = [number for number in self.numbers if numbers[number] > 1]
         require(root / "meta", not twice, "each episode once", f"{listed(twice)} several times")
@@ -129,16 +127,13 @@ class LeRobotDataset(Dataset):
         clock = self._clocks[episode.index]
         return f"{file_identity(video, verify=verify, revision=self.revision)} {from_s}{clock}"
 
-    def check(self, episode: DatasetEpisode, camera: str) -> int:
+    def check(self, episode: DatasetEpisode, camera: str) -> None:
         if camera in self.info.videos:
-            rows, frames = self._frames_of(episode, camera)
-            self._note_frames_without_rows(camera, rows)
-            return sum(rows.video.packets.num_bytes[frame] for frame in frames.tolist())
-        images = self._images(episode, camera)
-        for t, image in enumerate(images):
+            self._frames_of(episode, camera)
+            return
+        for t, image in enumerate(self._images(episode, camera)):
             with faults_at(_where(episode, camera, t)):
                 Picture(image).check()
-        return sum(map(len, images))
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         if camera in self.info.videos:
@@ -147,19 +142,6 @@ class LeRobotDataset(Dataset):
         for t, image in enumerate(self._images(episode, camera)):
             with faults_at(_where(episode, camera, t)):
                 yield Picture(image).pixels()
-
-    @property
-    def frame_notes(self) -> Sequence[str]:
-        lines = []
-        for camera, videos in self._without_rows.items():
-            num_left_out, num_frames = (sum(counts) for counts in zip(*videos.values(), strict=True))
-            names = first_names([file.relative_to(self.root).as_posix() for file in videos], 3)
-            of = f"{num_left_out} of the {num_frames} frames in {len(videos)} videos ({names})"
-            lines.append(f"left out: {camera}: {of}, because no row has their times")
-        moved = (
-            f"rows: found by episode_index: {EPISODES_FOLDER} names another file for {listed(sorted(self._rows.moved))}"
-        )
-        return [*lines, moved] if self._rows.moved else lines
 
     def times_s(self, episode: DatasetEpisode) -> Times:
         """Return float64 [T], each frame's time from the start of the episode. Raises DatasetError."""
@@ -184,16 +166,6 @@ class LeRobotDataset(Dataset):
         if isinstance(frames, DatasetError):
             raise frames
         return rows, frames
-
-    def _note_frames_without_rows(self, camera: str, rows: VideoRows) -> None:
-        """Keep the number of frames without rows if the rows of all episodes in the video are known."""
-        is_known = len(rows.parts) == len(self._in_video[camera, rows.video.file])
-        if self.info.version == "v3.0":  # an episode whose metadata are broken may lie in any video
-            entries = self._entries.values()
-            is_known = is_known and all(isinstance(e, Entry) and isinstance(e.videos[camera], tuple) for e in entries)
-        if is_known and rows.num_without_rows:
-            counts = (rows.num_without_rows, len(rows.video.packets.times_s))
-            self._without_rows.setdefault(camera, {})[rows.video.file] = counts
 
     @cached_property
     def _in_video(self) -> Mapping[tuple[str, Path], Sequence[Entry]]:

@@ -69,13 +69,6 @@ class VideoRows:
                 found[part.number] = DatasetError.at(f"{part.where}: {self._where}", expected, got)
         return found
 
-    @property
-    def num_without_rows(self) -> int:
-        """Number of frames without a row; 0 if an episode is faulty, because its frames are unknown."""
-        if any(isinstance(frames, DatasetError) for frames in self.frames.values()):
-            return 0
-        return len(self.video.packets.times_s) - len(self._rows_s)
-
     def apart_s(self, frames: Frames) -> float:
         """Return the shortest time between one of these frames and a neighbour, at most the time between two rows."""
         gaps_s = np.diff(self.video.packets.times_s, prepend=-np.inf, append=np.inf)

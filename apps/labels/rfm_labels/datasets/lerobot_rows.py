@@ -62,7 +62,6 @@ class RowReader:
     data: folder of all rows
     tasks: sentences by number
     given: the caller's task
-    moved: numbers of the episodes whose rows were found in another file than their metadata say
     """
 
     def __init__(self, data: Path, tasks: Sentences, given: TaskOverride) -> None:
@@ -70,7 +69,6 @@ class RowReader:
         self._tasks = tasks
         self._given = given
         self._columns = lru_cache(_FILES_AT_A_TIME)(_read_columns)
-        self.moved: set[int] = set()
 
     def read(self, entry: Entry) -> EpisodeRows:
         """Return the episode's rows. Raises DatasetError if they contradict its metadata."""
@@ -103,10 +101,7 @@ class RowReader:
         before.
         """
         stored = self._columns(entry.data_file, self._tasks.column)["episode_index"]
-        file = entry.data_file if (stored == entry.index).any() else self._files.get(entry.index, entry.data_file)
-        if file != entry.data_file:
-            self.moved.add(entry.index)
-        return file
+        return entry.data_file if (stored == entry.index).any() else self._files.get(entry.index, entry.data_file)
 
     @cached_property
     def _files(self) -> Mapping[int, Path]:

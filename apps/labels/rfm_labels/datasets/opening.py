@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""Open a dataset by path or Hub id, or say how to convert its layout."""
+"""Open a dataset by path or Hub id, or say how to convert its layout.
+
+``tasks.csv`` lists the episodes of a folder in order. Its columns ``video`` (or ``episode``) and ``task`` lie between
+commas, semicolons or tabs. A task with a comma is in quotes. Paths are relative to the table.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
 import os
 import re
-import shlex
-from collections.abc import Collection, Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Collection, Iterator, Mapping, Set
+from pathlib import Path, PurePath
+from typing import Any, TypeAlias
 
 from rfm_client.frames import ARRAY_SUFFIXES, ChannelOrder, Orientation, cached_snapshot
 from rfm_client.options import first_names
-from rfm_labels.datasets.cameras import AskedCorrections
-from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset, SeveralTasks, TaskOverride
-from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.datasets.dataset import SIGNALS_FOLDER, AskedCorrections, Dataset, SeveralTasks, TaskOverride
+from rfm_labels.datasets.faults import DatasetError, FaultsError, require, shortened
 from rfm_labels.datasets.folders import (
     ArrayFiles,
     Contents,
@@ -24,22 +28,25 @@ from rfm_labels.datasets.folders import (
     VideoFolder,
     in_natural_order,
     is_of_unitree,
+    is_pattern,
     is_picture,
 )
-from rfm_labels.datasets.frame_names import is_pattern
 from rfm_labels.datasets.hdf5 import SUFFIXES, Hdf5Dataset, is_hdf5
 from rfm_labels.datasets.lerobot import LeRobotDataset
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
 from rfm_labels.datasets.lerobot_meta import INFO_FILE, Info
 from rfm_labels.datasets.lerobot_rows import TASK_COLUMN
 from rfm_labels.datasets.rlds import RldsDataset, rlds_folder
-from rfm_labels.datasets.rlds_meta import FEATURES_FILE
-from rfm_labels.datasets.task_tables import TABLES, read_table_of_tasks, table_in
+from rfm_labels.datasets.rlds_files import FEATURES_FILE
 
+TABLE = "tasks.csv"
+_NAMES = ("video", "episode")  # columns of the path
+_DELIMITERS = ",;\t"
+_Line: TypeAlias = tuple[str, str, str | None]  # place, path and task
 _HUB_ID = re.compile(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")
 _LAYOUTS = (
     f"a LeRobot dataset ({INFO_FILE}), an RLDS dataset ({FEATURES_FILE}), an HDF5 file ({', '.join(SUFFIXES)}), a "
-    f"folder of videos, of folders of pictures or of {' and '.join(ARRAY_SUFFIXES)} files with {' or '.join(TABLES)}, "
+    f"folder of videos, of folders of pictures or of {' and '.join(ARRAY_SUFFIXES)} files with {TABLE}, "
     "or a Hub id org/name[@revision]"
 )
 _CONVERT = "convert them to LeRobot, or write each episode's pictures to a video and list the videos in tasks.csv"
@@ -62,6 +69,76 @@ _KINDS: dict[str, tuple[type[EpisodeFiles], str]] = {  # reader, and the name of
 }
 _OWN_TASKS = ("arrays", "recordings of Unitree")
 _FILES_OF_OURS = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside episodes with labels; of 0.4
+
+
+def read_table_of_tasks(table: Path, *, has_tasks: bool) -> Mapping[str, str | None]:
+    """Return the task of each episode, by path; None: no task. Raises DatasetError, which lists all faulty lines.
+
+    has_tasks: True: the file needs the column ``task``
+    """
+    try:
+        text = table.read_text(encoding="utf-8-sig")  # spreadsheets put a byte order mark first
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError.at(table, "a readable table of tasks", error) from error
+    faults: list[str] = []
+    name, lines = _from_csv(table, text, has_tasks, faults)
+    tasks: dict[str, str | None] = {}
+    for where, path, task in lines:
+        if not path.strip():
+            faults.append(f"{where}: expected the path of a {name}, got none")
+        elif (known := _normal(table.parent, path)) in tasks:
+            faults.append(f"{where}: expected each {name} once, got {path}")
+        else:
+            tasks[known] = task
+    if faults:
+        raise FaultsError.listing(shortened(faults))
+    require(table, bool(tasks), "at least one video", "none")
+    return tasks
+
+
+def _normal(root: Path, path: str) -> str:
+    """A path without ``./``, outer spaces or Windows backslashes, so that paths of the same file are equal."""
+    path = path.strip()
+    if "\\" in path and not (root / path).exists():
+        path = path.replace("\\", "/")
+    return PurePath(os.path.normpath(path)).as_posix()
+
+
+def _from_csv(table: Path, text: str, has_tasks: bool, faults: list[str]) -> tuple[str, Iterator[_Line]]:
+    """The name of the path column, and the lines."""
+    first, _, _ = text.partition("\n")
+    delimiter = next((each for each in _DELIMITERS if not set(_header(first, each)).isdisjoint(_NAMES)), ",")
+    columns = _header(first, delimiter)
+    name = next((column for column in _NAMES if column in columns), _NAMES[0])
+    required: Set[str] = {name, "task"} if has_tasks else {name}
+    got = f"{', '.join(columns) or 'none'} (--task stands for the column task)"
+    require(table, not required - set(columns), f"the columns {name} and task", got)
+    return name, _lines(table, text, delimiter, columns, name, faults)
+
+
+def _header(line: str, delimiter: str) -> list[str]:
+    return [cell.strip().lower() for cell in next(csv.reader([line], delimiter=delimiter), [])]
+
+
+def _lines(table: Path, text: str, delimiter: str, columns: list[str], name: str, faults: list[str]) -> Iterator[_Line]:
+    """The lines below the header, except lines with a wrong number of cells, which go to ``faults``."""
+    has_blanks = re.search(f'{delimiter} +"', text) is not None  # before a quote they would make it a part of the text
+    rows = csv.reader(io.StringIO(text), delimiter=delimiter, skipinitialspace=has_blanks, strict=True)
+    try:
+        next(rows)
+        for row in rows:
+            where = f"{table}: line {rows.line_num}"
+            if not any(map(str.strip, row)):
+                continue
+            if len(row) != len(columns):
+                expected = f"{len(columns)} cells (text with a comma in quotes)"
+                faults.append(f"{where}: expected {expected}, got {len(row)}")
+                continue
+            cells = dict(zip(columns, row, strict=True))
+            yield where, cells[name], cells.get("task")
+    except csv.Error as error:
+        where = f"{table}: line {rows.line_num}"
+        raise DatasetError.at(where, 'quotes around a whole cell, and "" for a quote in it', error) from error
 
 
 def open_dataset(
@@ -145,7 +222,8 @@ def hdf5_files(folder: str | Path) -> list[Path]:
     Files of labels and hidden files are left out. The order is that of the paths, with 2 before 10.
     """
     root = Path(folder)
-    if not root.is_dir() or (root / INFO_FILE).is_file() or table_in(root) or set(_found(root)) - {"HDF5 files"}:
+    is_other = any((root / name).is_file() for name in (INFO_FILE, TABLE))
+    if not root.is_dir() or is_other or set(_found(root)) - {"HDF5 files"}:
         return []
     names = (str(file.relative_to(root)) for file in root.rglob("*") if file.suffix.lower() in SUFFIXES)
     shown = [name for name in names if "/." not in f"/{name}" and not _FILES_OF_OURS.fullmatch(name)]
@@ -154,10 +232,10 @@ def hdf5_files(folder: str | Path) -> list[Path]:
 
 def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -> Dataset:
     """The dataset of a folder with a file or a folder for each episode, or of its table. Raises DatasetError."""
-    if path.is_file() and path.suffix.lower() not in (".csv", ".json"):
+    if path.is_file() and path.suffix.lower() != ".csv":
         raise DatasetError.at(path, _LAYOUTS, _unread(path) or "another file")
-    table = table_in(path) if path.is_dir() else path
-    if table is not None:
+    table = path / TABLE if path.is_dir() else path
+    if table.is_file():
         tasks = read_table_of_tasks(table, has_tasks=task.text is None)
         there = [name for name in tasks if (table.parent / name).exists()] or list(tasks)
         kinds = {_kind_of(table.parent / name): name for name in reversed(there)}
@@ -169,9 +247,11 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
         return dataset
     kind, names = _listed(path)
     reader, episode = _KINDS[kind]
-    is_told = task.text is not None or kind in _OWN_TASKS
+    is_of_before = (path / "tasks.json").is_file()  # of 0.4
+    is_told = (task.text is not None or kind in _OWN_TASKS) and not is_of_before
     got = f"none: write it, or, if all of them have one task, give it: {_GIVE_TASK}"
-    require(path, is_told, f"one of {' and '.join(TABLES)} with the task of each {episode}", got)
+    got = f"tasks.json: write it as {TABLE}, with the columns video and task" if is_of_before else got
+    require(path, is_told, f"{TABLE} with the task of each {episode}", got)
     return reader(Contents(path, dict.fromkeys(names), path, task, corrections))
 
 
@@ -255,8 +335,5 @@ def _unread(path: Path) -> str | None:
     if is_picture(deeper):
         listed = deeper.parent.relative_to(path)
         return f"pictures in deeper folders: list the folders of one camera ({listed}) in tasks.csv"
-    remedy = f"list those of one camera in tasks.csv ({deeper.relative_to(path)})"
-    if not re.search(r"\d", deeper.stem):  # the name of a camera, not the number of an episode
-        find = f"find . -name {shlex.quote(deeper.name)} | sort"
-        remedy = f"list those of one camera: (cd {shlex.quote(str(path))} && (echo video; {find}) > tasks.csv)"
-    return f"videos in deeper folders: {remedy}; with {_GIVE_TASK}, or a column task"
+    listed = deeper.relative_to(path)
+    return f"videos in deeper folders: list those of one camera ({listed}) in tasks.csv, with their tasks"

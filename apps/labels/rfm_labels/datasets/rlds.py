@@ -16,12 +16,17 @@ from typing import Any
 from rfm_client import RewardError, UInt8Array
 from rfm_client.frames import BlankFrames, FrameFileError, Picture
 from rfm_client.options import is_blank
-from rfm_labels.datasets.cameras import AskedCorrections
-from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, TaskOverride
+from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, require
-from rfm_labels.datasets.rlds_meta import FEATURES_FILE, INSTRUCTIONS, RldsInfo
+from rfm_labels.datasets.rlds_files import (
+    FEATURES_FILE,
+    INSTRUCTIONS,
+    RecordFile,
+    RldsInfo,
+    check_packages,
+    features_of,
+)
 from rfm_labels.datasets.stored_files import digest_of, faults_at
-from rfm_labels.datasets.tfrecords import RecordFile, check_packages, features_of
 
 
 def rlds_folder(path: Path) -> Path | None:
@@ -43,7 +48,6 @@ class _Pictures:
     """
 
     digest: str
-    num_bytes: int
     blank: str
     fault: DatasetError | None
 
@@ -118,11 +122,10 @@ class RldsDataset(Dataset):
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
         return self._record(episode.index).pictures[camera].digest
 
-    def check(self, episode: DatasetEpisode, camera: str) -> int:
-        pictures = self._record(episode.index).pictures[camera]
-        if pictures.fault is not None:
-            raise pictures.fault
-        return pictures.num_bytes
+    def check(self, episode: DatasetEpisode, camera: str) -> None:
+        fault = self._record(episode.index).pictures[camera].fault
+        if fault is not None:
+            raise fault
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         where = f"{self._where(episode.index)}: {camera}"
@@ -192,18 +195,18 @@ class RldsDataset(Dataset):
 
 
 def _pictures(where: str, stored: Sequence[bytes]) -> _Pictures:
-    digest, num_bytes = digest_of(stored), sum(map(len, stored))
+    digest = digest_of(stored)
     for t, picture in enumerate(stored):
         try:
             with faults_at(f"{where}: frame {t}"):
                 Picture(picture).check()
         except DatasetError as fault:
-            return _Pictures(digest, num_bytes, "", fault)
+            return _Pictures(digest, "", fault)
     blank = ""
     if all(picture == stored[0] for picture in stored):
         with suppress(FrameFileError):  # raised again by the frames
             blank = BlankFrames([Picture(stored[0]).pixels()]).told
-    return _Pictures(digest, num_bytes, blank, None)
+    return _Pictures(digest, blank, None)
 
 
 def _shown(text: bytes) -> str:
