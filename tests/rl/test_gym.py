@@ -5,10 +5,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import Autoreset, RecordEpisodeStatistics, TimeLimit
 
@@ -23,8 +21,8 @@ LENGTH = 8  # steps of an episode
 VIDEO = [frame_of(0, 0, step) for step in range(LENGTH + 1)]
 
 
-def options(source: Any, **more: Any) -> RewardOptions:
-    return RewardOptions(sampling="all", frames_from=source, **more)
+def options(**more: Any) -> RewardOptions:
+    return RewardOptions(sampling="all", frames_from="pixels", **more)
 
 
 def test_gymnasium_s_own_check_passes_and_close_closes_only_a_client_that_it_made(served: Served) -> None:
@@ -74,7 +72,7 @@ def test_several_cameras_are_scored_apart_and_fused(client: RewardClient, fuse: 
 
 
 def not_blocking(late: LateClient, **more: Any) -> RewardModelWrapper:
-    env = RewardModelWrapper(CodedEnv(0, (LENGTH,)), late, TASK, options("pixels", blocking=False, **more))
+    env = RewardModelWrapper(CodedEnv(0, (LENGTH,)), late, TASK, options(blocking=False, **more))
     env.reset()
     return env
 
@@ -155,46 +153,24 @@ def test_an_episode_ends_at_the_step_at_which_success_is_known_and_stays_a_succe
 
 def test_an_error_comes_out_at_the_latest_where_the_episode_ends(client: RewardClient) -> None:
     env = RewardModelWrapper(
-        CodedEnv(0, (MAX_FRAMES + 4,)), client, TASK, options("pixels", blocking=False, max_pending=MAX_FRAMES + 4)
+        CodedEnv(0, (MAX_FRAMES + 4,)), client, TASK, options(blocking=False, max_pending=MAX_FRAMES + 4)
     )
     with pytest.raises(InvalidSampleError, match=f"^num_frames: expected at most {MAX_FRAMES} .*, got"):
         play(env)
 
 
-# What only a wrapper of one environment has to do.
+# Gymnasium's Autoreset.
 
 
-def test_the_step_in_which_autoreset_resets_begins_an_episode_and_pays_nothing(recorder: Recorder) -> None:
-    coded = CodedEnv(0, (2,))
-    tasks = iter(TASKS)
-    env = RewardModelWrapper(
-        TimeLimit(Autoreset(coded), 9), recorder, lambda info: next(tasks), options("pixels", add_to_env_reward=True)
-    )
+def test_an_autoreset_outside_begins_an_episode_after_each_end_and_one_inside_is_refused(recorder: Recorder) -> None:
+    """One inside would not learn of an end by success."""
+    coded, tasks = CodedEnv(), iter(TASKS)
+    succeeds = options(terminate_on_success=SuccessRule(threshold=0.0))
+    with pytest.raises(ValueError, match=r"^env: expected no Autoreset inside, got one; wrap in the other order"):
+        RewardModelWrapper(TimeLimit(Autoreset(coded), 9), recorder, TASK, succeeds)
+    env = Autoreset(RewardModelWrapper(coded, recorder, lambda info: next(tasks), succeeds))
     env.reset()
-    told = [env.step(0) for _ in range(3)]
-    assert [terminated for _, _, terminated, _, _ in told] == [False, True, False]
-    assert told[1][1] > 1
-    assert told[2][1] == 0
-    assert told[2][4]["reward_model"]["step"] == 0
-    assert np.isnan(told[2][4]["reward_model"]["env_reward"])
+    assert env.step(0)[2]
+    _, reward, *_, info = env.step(0)
+    assert (reward, info["reward_model"]["step"]) == (0, 0)
     assert recorder.calls[-1] == [([(0, 1, 0)], TASKS[1])]
-
-
-@pytest.mark.parametrize("rule", [None, SuccessRule(threshold=0.0)], ids=["truncated", "succeeded"])
-def test_a_step_after_an_end_that_an_autoreset_below_does_not_learn_of_is_refused(
-    recorder: Recorder, rule: SuccessRule | None
-) -> None:
-    coded = CodedEnv()
-    inside: gym.Env[Any, Any] = Autoreset(coded) if rule else TimeLimit(Autoreset(coded), 1)
-    env = RewardModelWrapper(inside, recorder, TASKS[0], options("pixels", terminate_on_success=rule))
-    env.reset()
-    assert any(env.step(0)[2:4])
-    for _ in range(2):
-        with pytest.raises(ResetNeeded, match=r"^step: expected a reset, since the episode has ended, .*Autoreset"):
-            env.step(0)
-    assert coded.code == (0, 0, 1)  # it was not stepped
-    outside = Autoreset(env)
-    outside.reset()
-    assert any(outside.step(0)[2:4])
-    assert outside.step(0)[1] == 0
-    assert recorder.calls[-1] == [([(0, 2, 0)], TASKS[0])]

@@ -15,10 +15,10 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space
 
-from coded_env import SIZE_PX, CodedEnv, Recorder
+from coded_env import SIZE_PX, Code, CodedEnv, CodeReader, Recorder
 from environments import MODEL, TASK, LateClient, assert_close, cart_pole, progress
 from rfm_client import InvalidSampleError, RewardClient
-from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
+from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions
 from servers import Served
 
 NEXT_STEP, SAME_STEP, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
@@ -190,15 +190,6 @@ def test_tensors_are_paid_as_arrays_would_be(mode: AutoresetMode, source: str | 
         np.testing.assert_array_equal(of_model["reward_model"]["progress"], wanted_of_model["reward_model"]["progress"])
 
 
-def test_a_success_ends_an_episode_of_a_tensor_vector(recorder: Recorder) -> None:
-    rewarded = options(terminate_on_success=SuccessRule(threshold=0.0))
-    env = RewardModelVectorWrapper(TensorVector(DISABLED), recorder, TASKS, rewarded)
-    env.reset()
-    terminations = env.step(on_device([0, 0]))[2]
-    assert isinstance(terminations, OnDevice)
-    assert terminations.tolist() == [True, True]
-
-
 def test_a_partial_reset_that_a_vector_does_not_read_is_refused(recorder: Recorder) -> None:
     env = RewardModelVectorWrapper(TensorVector(SAME_STEP), recorder, TASKS, options())
     env.reset()
@@ -256,3 +247,20 @@ def test_another_kind_of_environment_is_refused_with_the_remedy(
 def test_the_only_environment_of_a_batch_is_taken(recorder: Recorder) -> None:
     only = gym.wrappers.FlattenObservation(Unbatched(Batch(1)))
     assert RewardModelWrapper(only, recorder, TASKS[0]).unwrapped.num_envs == 1  # type: ignore[attr-defined]
+
+
+class Rising(CodeReader):
+    """Scores each frame by its step."""
+
+    def scores(self, codes: list[Code]) -> dict[str, Any]:
+        return {"progress": np.array([0.0, 0.1, 0.3, 0.6])[[step for *_, step in codes]]}
+
+
+def test_torchrl_gets_the_rewards_of_each_environment_and_resets_those_that_have_ended() -> None:
+    torchrl = pytest.importorskip("torchrl.envs", reason="make test-newest installs it")
+    vector = SyncVectorEnv([partial(CodedEnv, 0, (3,)), partial(CodedEnv, 1, (2,))], autoreset_mode=DISABLED)
+    with Recorder(server=Rising()) as client:
+        env = torchrl.GymWrapper(RewardModelVectorWrapper(vector, client, TASKS, options(mode="delta")))
+        rewards = env.rollout(6, break_when_any_done=False)["next", "reward"][..., 0]
+    expected = [[0.1, 0.2, 0.3, 0.1, 0.2, 0.3], [0.1, 0.2, 0.1, 0.2, 0.1, 0.2]]
+    np.testing.assert_allclose(rewards, expected, atol=1e-6)

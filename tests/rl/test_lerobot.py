@@ -5,9 +5,7 @@ from __future__ import annotations
 
 import copy
 import pickle
-import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +13,7 @@ import pytest
 import torch
 
 import fake_lerobot
-from coded_env import Code, CodeReader, Recorder, frame_of
+from coded_env import Code, CodeReader, Recorder
 from environments import MODEL
 from rfm_client import (
     InferenceFailedError,
@@ -23,15 +21,13 @@ from rfm_client import (
     ProgressResult,
     RewardClient,
     ServerError,
-    Trajectory,
 )
-from rfm_client.frames import Sampling
 from servers import Served
 
 fake_lerobot.provide()
 
-from lerobot_reward_rfm import RfmFrameScorer, RfmRewardConfig, RfmRewardModel  # noqa: E402
-from lerobot_reward_rfm.prefixes import check_clear  # noqa: E402
+from lerobot_reward_rfm import RfmRewardConfig, RfmRewardModel  # noqa: E402
+from lerobot_reward_rfm.modeling_rfm import check_clear  # noqa: E402
 
 KEY, TASK = "observation.images.top", "stack the cups"
 PIXELS = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (2, 5, 3, 48, 64), np.uint8))  # [B, T, 3, H, W]
@@ -235,54 +231,3 @@ def test_the_key_stays_in_its_file(tmp_path: Path, served: Served) -> None:
     with config.connect() as client:  # an HTTP/2 header would refuse the line's end
         assert client.model_info(frames=True).name
     assert "secret" not in repr(config)
-
-
-@pytest.fixture
-def scoring(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Offline scoring, as a fake unless LeRobot has it."""
-    if "lerobot.rewards.scoring" not in sys.modules:
-        monkeypatch.setitem(sys.modules, "lerobot.rewards.scoring", fake_lerobot.scoring())
-
-
-class Dataset:
-    """Two episodes of 3 and 5 frames, as a LeRobotDataset gives them. first: index of the first frame that it has"""
-
-    def __init__(self, first: int = 0) -> None:
-        episodes = [(0, 3), (3, 8)]
-        self.meta = SimpleNamespace(
-            episodes=[{"dataset_from_index": start, "dataset_to_index": end} for start, end in episodes]
-        )
-        self.absolute_to_relative_idx = {index: index - first for index in range(first, 8)} if first else None
-        self.first = first
-
-    def __getitem__(self, position: int) -> dict[str, Any]:
-        index = position + self.first
-        episode = int(index >= 3)
-        image = torch.from_numpy(frame_of(0, episode, index)).permute(2, 0, 1) / 255
-        return {KEY: image, "task": TASK, "episode_index": torch.tensor(episode), "index": torch.tensor(index)}
-
-
-@pytest.mark.usefixtures("scoring")
-@pytest.mark.parametrize("first", [0, 3], ids=["all episodes", "one episode alone"])
-def test_a_frame_scorer_scores_each_frame_on_the_frames_up_to_it(client: RewardClient, first: int) -> None:
-    scorer = RfmFrameScorer(RfmRewardModel(RfmRewardConfig(sampling="rint", frames=4), client=client))
-    signals = scorer(Dataset(first), 1)
-    frames = np.stack([frame_of(0, 1, index) for index in range(3, 8)])
-    rule = Sampling("rint", 4)
-    wanted = rule.joined(
-        [client.evaluate([sample])[0] for sample in rule.samples(Trajectory(frames=frames, task=TASK))]
-    )
-    np.testing.assert_array_equal(signals.frame_indices, np.arange(5))
-    np.testing.assert_allclose(signals.signals["reward.rfm.progress"], wanted.progress, atol=1e-5)
-    np.testing.assert_allclose(signals.signals["reward.rfm.success_probability"], wanted.success, atol=1e-5)
-    assert {each.bounds for each in signals.descriptors.values()} == {(0.0, 1.0)}
-    assert {"sampling": "rint", "frames": 4}.items() <= scorer.options.items()
-    assert scorer.options["checkpoint"]["name"] == f"{MODEL}_frames"
-
-
-def test_a_frame_scorer_says_when_lerobot_has_no_offline_scoring(
-    recorder: Recorder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "lerobot.rewards.scoring", None)
-    with pytest.raises(ImportError, match="label the dataset with `rfm-client label` instead"):
-        RfmFrameScorer(RfmRewardModel(RfmRewardConfig(), client=recorder))

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorWrapper
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import RecordEpisodeStatistics
 from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorStatistics
 
@@ -22,7 +21,6 @@ from environments import TASK
 from paths import ROOT
 from rfm_client import RewardClient
 from rfm_rl import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
-from rfm_rl.own_rewards import WritingMonitor
 
 pytest.importorskip("stable_baselines3", reason="the extra sb3 is not installed")
 
@@ -157,10 +155,7 @@ def test_hindsight_relabelling_is_refused(recorder: Recorder, wrapping: Callable
     refusal = "compute_reward: expected no rewards for other goals, .* turn off hindsight relabelling"
     with pytest.raises(NotImplementedError, match=refusal):
         model.learn(8 * LENGTH)
-    with pytest.raises(NotImplementedError, match=refusal):
-        model.env.get_attr("compute_reward")[0](np.zeros((1, 2)), np.zeros((1, 2)), [{}])
     assert model.env.env_method("render")
-    assert model.env.get_attr("action_space") == [Reach.action_space] * model.env.num_envs
 
 
 class Pleased(CodeReader):
@@ -195,23 +190,6 @@ def test_an_end_by_success_is_an_episode_for_statistics(inside: Any) -> None:
         assert evaluate_policy(model, model.env, 2) == (1, 0)
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda client, file: single(client, Monitor(Reach(), file)),
-        lambda client, file: vector(client, monitored(monitor_dir=file)),
-        lambda client, file: vector(client, VecMonitor(rendered(), file)),
-    ],
-    ids=["one environment", "a vector", "a VecMonitor"],
-)
-def test_a_file_with_the_environment_s_rewards_is_told(
-    recorder: Recorder, tmp_path: Path, make: Callable[[RewardClient, str], Any]
-) -> None:
-    told = r"env: expected no Monitor inside that writes a file, .*; write \w+\(RewardModel\w+\(...\), filename\)"
-    with pytest.warns(UserWarning, match=told):
-        make(recorder, str(tmp_path / "own")).close()
-
-
 INSIDE: dict[str, Callable[[AutoresetMode], Any]] = {
     "each environment": lambda mode: SyncVectorEnv(
         [lambda: RecordEpisodeStatistics(CodedEnv(0, (3,))), lambda: RecordEpisodeStatistics(CodedEnv(1, (4,)))],
@@ -243,17 +221,6 @@ def test_statistics_inside_a_vector_show_the_reward_model_s_rewards(
     assert num_ended >= 5
 
 
-@pytest.mark.parametrize("inside", INSIDE.values(), ids=INSIDE)
-def test_statistics_inside_a_vector_tell_of_ends_by_success(inside: Callable[[AutoresetMode], Any]) -> None:
-    rewarded = RewardOptions(sampling="all", frames_from="pixels", terminate_on_success=SuccessRule())
-    with Recorder(server=Pleased()) as client:
-        env = RewardModelVectorWrapper(VectorWrapper(inside(AutoresetMode.DISABLED)), client, TASK, rewarded)
-        env.reset()
-        infos = env.step(np.zeros(2, int))[4]
-    assert infos["_episode"].tolist() == [True, True]
-    assert [infos["episode"][key].tolist() for key in "rl"] == [[1, 1], [1, 1]]
-
-
 REFUSED: dict[str, tuple[Any, type[Exception], str]] = {
     "no VecEnv": (Reach, TypeError, "^venv: expected a VecEnv of stable_baselines3, got .*Reach"),
     "no pictures": (
@@ -276,8 +243,3 @@ def test_a_vector_that_cannot_be_paid_is_refused(
     """Off-policy algorithms look for a ``VecNormalize`` and store the rewards that it got."""
     with pytest.raises(error, match=message):
         vector(recorder, make())
-
-
-def test_a_subprocess_gets_the_class_of_a_monitor_that_writes() -> None:
-    """A SubprocVecEnv pickles it."""
-    assert pickle.loads(pickle.dumps(WritingMonitor)) is WritingMonitor

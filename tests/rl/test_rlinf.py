@@ -128,16 +128,6 @@ def test_an_environment_without_pictures_gets_the_interval_reward(made: Any, cli
     assert_close(model.compute_reward(history([0, 0, 0], history_input={})), [-0.5] * 3)
 
 
-@pytest.mark.parametrize("dones", [[False] * 3, [True] * 3], ids=["per_step", "terminal"])
-def test_single_pictures_are_scored_only_on_request(made: Any, client: RewardClient, dones: list[bool]) -> None:
-    sent = {"main_images": torch.from_numpy(np.stack([video[0] for video in VIDEOS])), "dones": torch.tensor(dones)}
-    sent |= {"task_descriptions": [TASKS[0]] * 3}
-    with pytest.raises(InvalidSampleError, match=r"history_input: expected the history .*reward_mode: history_buffer"):
-        made().compute_reward(sent)
-    rewards = made(single_pictures=True).compute_reward(sent)
-    assert_close(rewards, [scored(client, env, 1, TASKS[0]).progress for env in range(3)])
-
-
 def test_the_last_picture_of_an_episode_keeps_its_task(made: Any, client: RewardClient) -> None:
     ended = {"dones": torch.tensor([False, True, False]), "task_descriptions": ["a", "the next task", "b"]}
     sent = history([5, 3, 1], tasks=True, **ended)
@@ -179,6 +169,11 @@ def bad(**change: Any) -> dict[str, Any]:
             bad(history_input={"episode": {"main_images": [[VIDEOS[0][0] / 255], [], []]}}), r"envs\[0\]", id="floats"
         ),
         pytest.param(
+            bad(history_input=None),
+            r"history_input: expected the history .*reward_mode: history_buffer",
+            id="no history",
+        ),
+        pytest.param(
             bad(dones=torch.tensor([True, False, False]), history_input={}),
             r"envs\[0\]: expected the pictures of the episode that ended",
             id="dropped",
@@ -195,7 +190,6 @@ def test_an_input_at_fault_is_an_error(made: Any, sent: dict[str, Any], message:
     [
         ({"url": None}, "reward.model.rfm.url: expected the server's address"),
         ({"reward": "final"}, "reward.model.rfm.reward: expected one of progress, delta, success"),
-        ({"reward": "delta", "single_pictures": True}, "progress or success with single_pictures"),
         ({"intervall_reward": 1}, "reward.model.rfm: expected the keys url, .* got intervall_reward"),
         ({"episode": {"camera": "x"}}, "camera"),
         ({"client": {"timeout": 1}}, "timeout"),

@@ -10,7 +10,7 @@ import importlib.util
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -64,8 +64,3 @@ def module(name: str, names: Mapping[str, Any]) -> ModuleType:
     made = ModuleType(name, "A fake of LeRobot, for tests.")
     made.__dict__.update(names)
     return made
-
-
-def scoring() -> ModuleType:
-    """Return a fake of LeRobot's offline scoring, which no release has yet."""
-    return module("lerobot.rewards.scoring", {"FrameSignals": SimpleNamespace, "SignalDescriptor": SimpleNamespace})

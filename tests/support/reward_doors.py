@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers import Autoreset
 
 from coded_env import CodedEnv
 from rfm_client import RewardClient
@@ -85,11 +84,10 @@ class Single(Door):
     """Each environment in a wrapper of its own."""
 
     resets, asks_once = BY_CALLER, False
-    inside: Callable[[Any], Any] = staticmethod(lambda env: env)
 
     def wrap(self, makers: Sequence[Maker], client: RewardClient, tasks: list[str], options: RewardOptions) -> None:
         pairs = zip(makers, tasks, strict=True)
-        self.envs = [RewardModelWrapper(self.inside(make()), client, task, options) for make, task in pairs]
+        self.envs = [RewardModelWrapper(make(), client, task, options) for make, task in pairs]
 
     def reset(self, mask: Sequence[bool] | None = None) -> dict[int, Info]:
         return {index: env.reset()[1] for index, env in enumerate(self.envs) if mask is None or mask[index]}
@@ -100,10 +98,6 @@ class Single(Door):
     def close(self) -> None:
         for env in self.envs:
             env.close()
-
-
-class AutoresetBelow(Single):
-    resets, inside = NEXT_STEP, Autoreset
 
 
 class Vector(Door):
@@ -202,7 +196,7 @@ def info_of(infos: Mapping[str, Any], index: int) -> Info:
 
 
 VECTORS: dict[str, type[Door]] = {"NEXT_STEP": NextStep, "SAME_STEP": SameStep, "DISABLED": Disabled, "VecEnv": Sb3}
-DOORS: dict[str, type[Door]] = {"single": Single, "Autoreset below": AutoresetBelow, **VECTORS}
+DOORS: dict[str, type[Door]] = {"single": Single, **VECTORS}
 ENDED_BY_SUCCESS = {"single": Single, "DISABLED": Disabled}
 
 

@@ -4,6 +4,5 @@
 from lerobot_reward_rfm.configuration_rfm import RfmRewardConfig
 from lerobot_reward_rfm.modeling_rfm import RfmPrediction, RfmRewardModel
 from lerobot_reward_rfm.processor_rfm import make_rfm_pre_post_processors
-from lerobot_reward_rfm.scoring_rfm import RfmFrameScorer
 
-__all__ = ["RfmFrameScorer", "RfmPrediction", "RfmRewardConfig", "RfmRewardModel", "make_rfm_pre_post_processors"]
+__all__ = ["RfmPrediction", "RfmRewardConfig", "RfmRewardModel", "make_rfm_pre_post_processors"]

@@ -36,18 +36,13 @@ def trajectory_of(
     """Return one sample's trajectory. images: [T, 3, H, W] or [T, H, W, 3]. index: of the sample, for errors"""
     step = {config.image_key: images} if pad is None else {config.image_key: images, f"{config.image_key}_is_pad": pad}
     try:
-        return as_configured(as_trajectory(step, task=task), config)
+        trajectory = as_trajectory(step, task=task)
     except InvalidSampleError as error:
         raise InvalidSampleError(
             f"sample {index} of the batch: {error}. Give images as the dataset or the camera has them, "
             "before any normalization"
         ) from error
-
-
-def as_configured(trajectory: Trajectory, config: RfmRewardConfig) -> Trajectory:
-    """Return the trajectory with frames turned as ``config.orient`` says."""
-    frames = None if trajectory.frames is None else config.correction.applied(trajectory.frames)
-    return replace(trajectory, frames=frames)
+    return replace(trajectory, frames=config.correction.applied(trajectory.positions))
 
 
 def images_of(batch: Mapping[str, Any], key: str) -> Any:

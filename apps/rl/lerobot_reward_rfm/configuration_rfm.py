@@ -74,11 +74,6 @@ class RfmRewardConfig(RewardModelConfig):
             checked_count("frames", self.frames)
 
     @property
-    def camera(self) -> str:
-        """The camera's name; ``image`` for the nameless ``observation.image``."""
-        return self.image_key.removeprefix("observation.images.").removeprefix("observation.")
-
-    @property
     def correction(self) -> Correction:
         """How the camera's frames become upright."""
         return Correction(self.orient)  # type: ignore[arg-type]  # checked above; LeRobot's parser knows no Literal

@@ -22,8 +22,8 @@ frame, and in delta mode the next reward includes its change. If the frame was l
 ResetNeeded. A step after an episode's end does, too, unless the environment resets in that step.
 
 ``compute_reward`` of RewardModelWrapper raises NotImplementedError: hindsight relabelling would mix the environment's
-rewards with the model's. With a Monitor or RecordEpisodeStatistics inside the wrapper, ``info["episode"]`` has the sum
-of the model's rewards, also at an end by ``terminate_on_success``, which they do not see.
+rewards with the model's. With a Monitor or RecordEpisodeStatistics inside a wrapper, ``info["episode"]`` has the sum of
+the model's rewards. RewardModelWrapper adds it at an end by ``terminate_on_success``, which they do not see.
 
 A time limit belongs inside the wrapper, as ``gymnasium.make`` puts it. A reset of an unended episode that drops a
 reward logs a warning, once. In mode ``final``, a second such reset in a row, with no end of an episode and no error in
@@ -41,14 +41,7 @@ import numpy as np
 from rfm_client.options import InvalidValueError, require
 from rfm_rl.envs import INFO, ClientSource, RewardedEnvs
 from rfm_rl.own_resets import HAS_RESET, check_observes_its_end, check_renders_its_end, watched_resets
-from rfm_rl.own_rewards import (
-    RETURNS,
-    WritingMonitor,
-    refuse_relabelling,
-    warn_of_file,
-    with_statistics,
-)
-from rfm_rl.rewards import Info, RewardOptions
+from rfm_rl.rewards import RETURNS, Info, RewardOptions, refuse_relabelling, with_statistics
 
 DEFAULTS = RewardOptions()
 _ALL = np.ones(1, np.bool_)
@@ -67,12 +60,11 @@ class RewardModelWrapper(gymnasium.Wrapper):
     task: the task sentence, or a function that reads it from the info of each reset
 
     A step after an episode's end raises ResetNeeded. With ``Autoreset(RewardModelWrapper(env, ...))`` of
-    ``gymnasium.wrappers``, this step begins a new episode instead, with reward 0. An ``Autoreset`` among the wrappers
-    of ``env`` does the same, but does not see an end by ``terminate_on_success``. If ``env`` itself resets in the step
+    ``gymnasium.wrappers``, this step begins a new episode instead, with reward 0. If ``env`` itself resets in the step
     that ends an episode, that step raises InvalidSampleError, unless frames come from an observation before the reset.
 
-    Raises ValueError if ``options`` names a source of frames that ``env`` lacks; TypeError if ``env`` is no
-    ``gymnasium.Env``.
+    Raises ValueError if ``options`` names a source of frames that ``env`` lacks, and for an ``Autoreset`` among the
+    wrappers of ``env``; TypeError if ``env`` is no ``gymnasium.Env``.
     """
 
     def __init__(
@@ -84,32 +76,30 @@ class RewardModelWrapper(gymnasium.Wrapper):
     ) -> None:
         check_kind(env, gymnasium.Env)
         check_frame_source(options, env.render_mode, env.observation_space)
-        if any(isinstance(layer, WritingMonitor) for layer in _layers(env)):
-            warn_of_file("env", "Monitor(RewardModelWrapper(...), filename)")
+        resets = any(isinstance(layer, gymnasium.wrappers.Autoreset) for layer in _layers(env))
+        require(
+            "env", not resets, "no Autoreset inside", "one; wrap in the other order: Autoreset(RewardModelWrapper(...))"
+        )
         super().__init__(env)
         self._envs = RewardedEnvs(client, options, [""], remedy=_REMEDY, is_only=True)
         self._options = options
         self._task = task
         self._has_statistics = env.has_wrapper_attr(RETURNS)
-        self._autoresets = [layer for layer in _layers(env) if isinstance(layer, gymnasium.wrappers.Autoreset)]
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and score its first frame. Cancel open requests. Raises RewardError, ValueError."""
         self._envs.check_reset(_ALL)
         observation, info = self.env.reset(seed=seed, options=options)
-        self._set_task(info)
+        self._envs.tasks[0] = self._task if isinstance(self._task, str) else self._task(info)
         self._envs.begin(lambda _: self._frame(observation))
         return observation, {**info, INFO: self._envs.episodes[0].info()}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
         """Step the environment; return the reward model's reward. Raises RewardError, ResetNeeded."""
-        resets = any(wrapper.autoreset for wrapper in self._autoresets)
-        self._envs.check_step(_ALL & resets)
+        self._envs.check_step(~_ALL)
         with watched_resets(self.env) as own_resets:
             observation, env_reward, terminated, truncated, info = self.env.step(action)
-        if resets:
-            self._set_task(info)
-        elif terminated or truncated:
+        if terminated or truncated:
             check_observes_its_end(info)
             check_renders_its_end(self._options, "info", bool(own_resets) or HAS_RESET in info)
         said = [float(env_reward)], [bool(terminated)], [bool(truncated)]
@@ -124,9 +114,6 @@ class RewardModelWrapper(gymnasium.Wrapper):
         """Cancel open requests; close the environment, and the client if it was made here."""
         self._envs.close()
         super().close()
-
-    def _set_task(self, info: Info) -> None:
-        self._envs.tasks[0] = self._task if isinstance(self._task, str) else self._task(info)
 
     def _frame(self, observation: Any) -> Any:
         return self.env.render() if self._options.renders else self._options.frames_of(observation)

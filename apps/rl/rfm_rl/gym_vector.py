@@ -21,8 +21,7 @@ from rfm_client.options import InvalidValueError, require
 from rfm_rl.envs import INFO, ClientSource, Mask, RewardedEnvs
 from rfm_rl.gym import DEFAULTS, check_frame_source, check_kind, tasks_of
 from rfm_rl.own_resets import HAS_RESET, check_renders_its_end, copied_steps, watched_resets
-from rfm_rl.own_rewards import RETURNS, correct_statistics
-from rfm_rl.rewards import Info, RewardOptions
+from rfm_rl.rewards import Info, RewardOptions, correct_statistics
 
 _INSTEAD_OF_SAME_STEP = "make the vector with autoreset_mode=AutoresetMode.NEXT_STEP"
 _REMEDY = 'call reset, for some environments with options={"reset_mask": mask}'
@@ -75,7 +74,6 @@ class RewardModelVectorWrapper(VectorWrapper):
         )
         self._options = options
         self._autoreset_mode = autoreset_mode
-        self._has_statistics = _has_statistics(env)
         self._here = here if options.renders or autoreset_mode is AutoresetMode.SAME_STEP else []  # in this process
 
     @property
@@ -115,8 +113,8 @@ class RewardModelVectorWrapper(VectorWrapper):
         shown = partial(self._frame, self._shown(observations))
         rewards, stepped = self._envs.keep(shown, as_array(env_rewards), terminated, truncated, final=final)
         for index, episode in stepped.items():
-            missed = correct_statistics(infos, index, episode, has_statistics=self._has_statistics)
-            scores: Info = {INFO: episode.info(), **missed}
+            correct_statistics(infos, index, episode)
+            scores: Info = {INFO: episode.info()}
             has_reset = resets_at_once and ended[index]
             infos = self._add_info(infos, {"final_info": scores} if has_reset else scores, index)
         infos = self._with_scores(infos, resetting | (ended & resets_at_once))
@@ -199,13 +197,6 @@ def _like(given: Any, values: npt.NDArray[Any]) -> Any:
         return values
     typed = given.bool() if values.dtype == np.bool_ else given.float()  # ManiSkill's sparse rewards are bool
     return typed.new_tensor(values)
-
-
-def _has_statistics(env: VectorEnv) -> bool:
-    """True with a RecordEpisodeStatistics around the vector or around environments in it."""
-    if isinstance(env, VectorWrapper):
-        return hasattr(env, RETURNS) or _has_statistics(env.env)
-    return any(_of_each(env, "has_wrapper_attr", RETURNS))
 
 
 def _of_each(env: VectorEnv, name: str, *args: str) -> Sequence[Any]:

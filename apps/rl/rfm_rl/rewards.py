@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, NoReturn, TypeAlias, get_args
 
 import numpy as np
 
@@ -16,6 +16,10 @@ from rfm_client.options import InvalidValueError, checked_count, checked_finite,
 
 Mode: TypeAlias = Literal["absolute", "delta", "shaping", "final"]
 Info: TypeAlias = dict[str, Any]
+
+RELABELS = "compute_reward"  # method of an environment that rewards a step for another goal
+RETURNS = "episode_returns"  # attribute of Monitor and RecordEpisodeStatistics
+_STATISTICS = "episode"  # key in info, of Monitor and RecordEpisodeStatistics
 
 _PAID: dict[Mode, Callable[[float, float, float, bool], float]] = {  # of progress now and before, gamma, the end
     "absolute": lambda now, before, gamma, is_end: now,
@@ -234,3 +238,34 @@ class RewardedEpisode:
         told: Info = {**self._paid, "progress": known.progress, "success": known.success, "step": known.step}
         told |= {"lag": self.steps.step - known.step, "skipped": self.num_skipped, **known.more_scores}
         return told if self._options.success_rule is None else told | {"succeeded": self._has_succeeded}
+
+
+def refuse_relabelling(*_args: object, **_kwargs: object) -> NoReturn:
+    """Raise NotImplementedError: a reward for another goal would be the environment's own."""
+    expected = "no rewards for other goals, since the reward model scores frames and a task sentence"
+    remedy = "turn off hindsight relabelling (HerReplayBuffer); other replay buffers keep the model's rewards"
+    raise NotImplementedError(f"{RELABELS}: expected {expected}, got a call; {remedy}")
+
+
+def with_statistics(info: Info, episode: RewardedEpisode, *, has_statistics: bool = False) -> Info:
+    """Return the info of a step. Statistics from a Monitor inside the wrapper show the model's rewards.
+
+    has_statistics: True: a Monitor inside tells of ends, but does not see one by ``terminate_on_success``
+    """
+    told = info.get(_STATISTICS)
+    if isinstance(told, dict) and "r" in told:
+        return {**info, _STATISTICS: {**told, **_statistics(episode)}}
+    return {**info, _STATISTICS: _statistics(episode)} if has_statistics and episode.succeeded else info
+
+
+def correct_statistics(infos: Info, index: int, episode: RewardedEpisode) -> None:
+    """Let the statistics in the infos of a Gymnasium vector show the model's rewards."""
+    for info in (infos, infos.get("final_info")):
+        if isinstance(info, dict) and f"_{_STATISTICS}" in info and info[f"_{_STATISTICS}"][index]:
+            for key, value in _statistics(episode).items():
+                if key in info[_STATISTICS]:
+                    info[_STATISTICS][key][index] = value
+
+
+def _statistics(episode: RewardedEpisode) -> dict[str, float]:
+    return {"r": episode.total_reward, "l": episode.steps.step}

@@ -7,8 +7,8 @@ Each worker of RLinf then calls ``register``, and ``reward.model.model_type: rfm
 stand under ``reward.model.rfm``.
 
 With ``reward.reward_mode: history_buffer``, RLinf sends ``history_input[buffer][key][env][t]``: the pictures of an
-environment since its episode began, or the last ``history_size`` of them. With ``per_step`` and ``terminal``, it sends
-one picture of each environment, without its past.
+environment since its episode began, or the last ``history_size`` of them. Other modes, which send one picture without
+its past, are refused.
 """
 
 from __future__ import annotations
@@ -53,7 +53,6 @@ class RfmRewardOptions:
     task: the task of all environments, instead of ``task_descriptions``
     buffer: the history buffer to score, if there are several
     interval_reward: reward of an environment for which RLinf sends no pictures in this step
-    single_pictures: True: score pictures without their past, as ``reward_mode`` ``per_step`` and ``terminal`` send them
     """
 
     url: str | Sequence[str]
@@ -63,14 +62,11 @@ class RfmRewardOptions:
     task: str | None = None
     buffer: str | None = None
     interval_reward: float = 0.0
-    single_pictures: bool = False
 
     def __post_init__(self) -> None:
         choices = ", ".join(get_args(Reward))
         require(f"{_WHERE}.reward", self.reward in get_args(Reward), f"one of {choices}", repr(self.reward))
         checked_finite(f"{_WHERE}.interval_reward", self.interval_reward)
-        has_past = self.reward != "delta" or not self.single_pictures
-        require(f"{_WHERE}.reward", has_past, "progress or success with single_pictures", repr(self.reward))
         object.__setattr__(self, "episode", {"cameras": ["main_images"], **self.episode})
         EpisodeOptions(**self.episode)
 
@@ -113,8 +109,7 @@ class RfmRewardModel(BaseRewardModel):  # type: ignore[misc]  # RLinf is optiona
         buffer = buffers.get(self._buffer) or {}
         self._sends_ends = bool(buffer.get("input_on_done")) and (buffer.get("min_history_size") or 0) <= 1
         self._tasks: set[str] = set()
-        urls = self.options.url
-        self._client = RewardClient(urls, **self.options.client)
+        self._client = RewardClient(self.options.url, **self.options.client)
 
     def forward(self, input_data: Any, labels: Any = None) -> dict[str, Any]:
         """Raise NotImplementedError: the server's model is not trained here."""
@@ -135,25 +130,13 @@ class RfmRewardModel(BaseRewardModel):  # type: ignore[misc]  # RLinf is optiona
     def _pictures(self, observations: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the values by key, environment and time; empty: RLinf sends none in this step."""
         history = observations.get(HISTORY)
-        if history is None:
-            require(
-                HISTORY,
-                self.options.single_pictures,
-                "the history of each environment (set reward.reward_mode: history_buffer; to score pictures without "
-                f"their past, set {_WHERE}.single_pictures: true)",
-                "none",
-                InvalidSampleError,
-            )
-            keys = [key for key in self.options.cameras if key in observations]
-            found = {key: [[value] for value in observations[key]] for key in keys}
-        else:
-            found = history.get(_chosen(self._buffer, list(history)), {})
-            if not found:
-                return {}
-        missing = [key for key in self.options.cameras if key not in found]
-        where = f"{HISTORY}[{self._buffer!r}]" if history is not None else "observations"
+        expected = "the history of each environment (set reward.reward_mode: history_buffer)"
+        require(HISTORY, history is not None, expected, "none", InvalidSampleError)
+        assert history is not None
+        found: Mapping[str, Any] = history.get(_chosen(self._buffer, list(history)), {})
+        has_all = not found or found.keys() >= set(self.options.cameras)
         expected = f"pictures under {', '.join(self.options.cameras)} ({_WHERE}.episode.cameras; history_keys)"
-        require(where, not missing, expected, ", ".join(found) or "none", InvalidSampleError)
+        require(f"{HISTORY}[{self._buffer!r}]", has_all, expected, ", ".join(found), InvalidSampleError)
         return found
 
     def _windows(self, observations: Mapping[str, Any], pictures: Mapping[str, Any]) -> list[_Window]:
@@ -171,7 +154,7 @@ class RfmRewardModel(BaseRewardModel):  # type: ignore[misc]  # RLinf is optiona
                 frames = [{key: _image(column[t]) for key, column in columns.items()} for t in range(count)]
                 kept = pictures[TASKS][env] if TASKS in pictures else None
                 windows.append(_Window(env, self._task(env, observations.get(TASKS), kept, is_done), frames))
-            elif is_done and HISTORY in observations and self._sends_ends:
+            elif is_done and self._sends_ends:
                 expected = "the pictures of the episode that ended (RLinf drops them if environments of several "
                 expected += "env workers end in different steps: set input_interval: 1)"
                 require(_of(env), False, expected, "none", InvalidSampleError)

@@ -22,14 +22,7 @@ from rfm_client.options import require
 from rfm_rl.envs import INFO, ClientSource, RewardedEnvs
 from rfm_rl.gym import DEFAULTS, check_frame_source, tasks_of
 from rfm_rl.own_resets import HAS_RESET, CopiedObservation, check_renders_its_end, copied_steps, watched_resets
-from rfm_rl.own_rewards import (
-    RELABELS,
-    WritingMonitor,
-    refuse_relabelling,
-    warn_of_file,
-    with_statistics,
-)
-from rfm_rl.rewards import Info, RewardOptions
+from rfm_rl.rewards import RELABELS, Info, RewardOptions, refuse_relabelling, with_statistics
 
 try:
     from stable_baselines3.common.vec_env import (
@@ -101,12 +94,15 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         )
         instead = f"{options.terminate_on_success}; wrap each environment in RewardModelWrapper instead"
         require("terminate_on_success", options.terminate_on_success is None, "None, since a VecEnv resets", instead)
-        _check_own_rewards(venv)
+        expected = "no VecNormalize inside, whose rewards SAC and other off-policy algorithms would learn from"
+        instead = "one; wrap in the other order: VecNormalize(RewardModelVecEnv(...))"
+        require("venv", unwrap_vec_normalize(venv) is None, expected, instead)
         tasks = tasks_of(task, venv.num_envs)
         final = "infos[{}]['terminal_observation']"
         is_here = isinstance(venv.unwrapped, DummyVecEnv) and not options.renders
         self._here = list(venv.unwrapped.envs) if is_here else []  # environments in this process
-        in_processes = _has_own_envs(venv) and all(venv.env_is_wrapped(CopiedObservation))
+        may_look = isinstance(venv.unwrapped, (DummyVecEnv, SubprocVecEnv))
+        in_processes = may_look and all(venv.env_is_wrapped(CopiedObservation))
         copies = options.renders or is_here or in_processes
         self._envs = RewardedEnvs(client, options, tasks, remedy="call reset", final=final, returns_copies=copies)
         self._reward_options = options
@@ -162,13 +158,6 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         results: list[Any] = self.venv.env_method(method_name, *args, indices=indices, **kwargs)
         return results
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of the environments. Raises NotImplementedError for ``compute_reward``."""
-        if attr_name == RELABELS:
-            refuse_relabelling()
-        values: list[Any] = self.venv.get_attr(attr_name, indices)
-        return values
-
     def close(self) -> None:
         """Cancel open requests; close the environments, and the client if it was made here."""
         self._envs.close()
@@ -195,19 +184,6 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         where, expected = f"infos[{index}]", "the terminal_observation of the episode that ended in this step"
         require(where, "terminal_observation" in info, expected, f"none in {list(info)}", InvalidSampleError)
         return self._reward_options.frames_of(info["terminal_observation"])
-
-
-def _check_own_rewards(venv: Any) -> None:
-    """Raise ValueError where the environments' rewards would be learnt; warn where they would be written to a file."""
-    expected = "no VecNormalize inside, whose rewards SAC and other off-policy algorithms would learn from"
-    instead = "one; wrap in the other order: VecNormalize(RewardModelVecEnv(...))"
-    require("venv", unwrap_vec_normalize(venv) is None, expected, instead)
-    if isinstance(venv, WritingMonitor) or (_has_own_envs(venv) and any(venv.env_is_wrapped(WritingMonitor))):
-        warn_of_file("venv", "VecMonitor(RewardModelVecEnv(...), filename)")
-
-
-def _has_own_envs(venv: Any) -> bool:
-    return isinstance(venv.unwrapped, (DummyVecEnv, SubprocVecEnv))  # other kinds may not be able to look
 
 
 def _of_env(observations: Any, index: int) -> Any:
