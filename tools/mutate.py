@@ -42,7 +42,7 @@ PARTS = {
     " families/test_usual_encoders.py",
     "rfm/triton_model/batch_model.py": "triton/test_batch_model.py triton/test_pipeline.py",
     "rfm/triton_model/pipeline.py": "triton/test_pipeline.py",
-    "client/rfm_client/scoring/samples.py": "contract/test_samples.py client/test_client_servers.py",
+    "client/rfm_client/scoring/batching.py": "contract/test_samples.py client/test_client_servers.py",
 }
 CONFIG = """
 [cosmic-ray]

@@ -244,7 +244,9 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         """Return as soon as ``is_ready``. Raises DeadlineExceededError, or ServerUnavailableError for wrong ports."""
         deadline = self._deadline(timeout_s)
         await self._servers.check_ports()
-        while not await self.is_ready(timeout_s=min(PROBE_TIMEOUT_S, deadline.remaining_s())):
+        while deadline.ends_within(0) or not await self.is_ready(
+            timeout_s=min(PROBE_TIMEOUT_S, deadline.remaining_s())
+        ):
             if deadline.ends_within(READY_POLL_S):
                 names = f"{self.model} and {frames_name(self.model)}"
                 why = await self._why_unready()

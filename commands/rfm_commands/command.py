@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, ClassVar, NoReturn
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -34,7 +33,6 @@ class RfmCommands(command.Commands):
 
     other_program = "rfm-client"
     others = ("score", "compare", "status", "wait", "sample", "bench-input", "evaluate")
-    renamed: ClassVar[Mapping[str, str]] = {"demo": "try"}
 
 
 def say(line: str) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import clip
-from client_commands import MODEL, RFM_CLIENT, TASK, ask, assert_scores
+from client_commands import MODEL, RFM_CLIENT, TASK, ask, assert_scores, invoke
 from engine_server import EngineServer
 from rfm_client import FrameScores, ProgressResult
 from rfm_client.cli.documents import frame_document
@@ -27,8 +27,8 @@ from rfm_client.contract.wire import encode_samples
 from rfm_client.serving import ServerStatus
 from rfm_client.transport.status import ModelStatus
 from servers import Endpoints
-from terminals import WIDTH, on_terminal
 
+WIDTH = 80  # of a terminal
 NAMES = ("episode_a.mp4", "episode_b.mp4")
 
 
@@ -41,27 +41,24 @@ def videos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [folder / name for name in NAMES]
 
 
-def shown(url: str, *asked: object, code: ExitCode = ExitCode.OK) -> tuple[set[str], list[str]]:
+def shown(url: str, *asked: object, code: ExitCode = ExitCode.OK) -> tuple[set[str], str]:
     """Run a command about the demo's checkpoint. Return words and lines, which fit the terminal."""
-    told, lines = on_terminal(*asked, "--url", url)
-    assert told == code, lines
-    assert max(map(len, lines)) <= WIDTH
-    return {word for line in lines for word in line.split()}, lines
+    result = invoke(*asked, "--url", url, env={"COLUMNS": f"{WIDTH}"})
+    assert result.exit_code == code, result.output
+    assert max(map(len, result.stdout.splitlines())) <= WIDTH
+    return {*result.stdout.split()}, result.stdout
 
 
-@pytest.mark.slow
 def test_the_state_of_a_server_fits_a_terminal_and_ends_with_what_to_try_next(demo_server: Endpoints) -> None:
     url = demo_server.grpc_url
-    words, lines = shown(url, "status", "--metrics-url", demo_server.metrics_url)
+    words, told = shown(url, "status", "--metrics-url", demo_server.metrics_url)
     heads = {"model", "v", "state", "requests", "failed", "refused", "pending", "batches", "samples", "queue", "ms"}
     assert heads | {"rfm", "rfm_encoder", "rfm_frames"} <= words
-    told = " ".join(" ".join(lines).split())
     assert f"rfm-client score VIDEO --task TASK --url {url}" in told
     assert f"rfm-client gateway --port 8100 --triton {url}" in told
     assert "http://localhost:8100/" in told
 
 
-@pytest.mark.slow
 def test_scores_and_comparisons_fit_a_terminal_and_name_each_file(engines: EngineServer, videos: list[Path]) -> None:
     words, _ = shown(engines.url, "score", *videos, "missing.mp4", "--task", TASK, code=ExitCode.FAILED)
     assert {"video", "progress", "success", "frames", "version"} <= words

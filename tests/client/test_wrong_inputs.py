@@ -102,7 +102,6 @@ USAGE = {
     f"rfm-client gateway --triton {NOBODY} --dataset file.txt": bad("--dataset", f"{SHOWN} file.txt"),
     "rfm-client label dataset --override-task": "Invalid value: --override-task needs --task",
     "rfm score a.mp4": "No such command 'score': that is `rfm-client score`",
-    "rfm demo": "No such command 'demo': it is now `rfm try`",
     "rfm serve": "Invalid value: give FOLDER or --repository",
     "rfm serve repository other": ("Invalid value: expected one FOLDER, and after it -- --OPTION=VALUE, got other"),
     "rfm serve repository --log-verbose=1": (

@@ -18,7 +18,7 @@ from rfm_client import (
     float_frames_to_uint8,
 )
 from rfm_client.contract import wire
-from rfm_client.scoring.samples import MAX_REQUEST_BYTES, groups, padded_bytes, parts
+from rfm_client.scoring.batching import MAX_REQUEST_BYTES, groups, padded_bytes, parts
 
 FRAMES = np.zeros((3, 8, 6, 3), np.uint8)
 VIDEO = np.ones((3, 5), np.float32)

@@ -126,11 +126,11 @@ def test_the_gateway_beside_tls_listens_on_loopback_alone(mutual: Endpoints) -> 
 
 
 def test_rfm_models_shows_a_certificate(mutual: Endpoints, papers: Papers, key_file: Path) -> None:
-    words = ["list", "--url", mutual.grpc_url, "--admin-key-file", str(key_file)]
+    words = ["--url", mutual.grpc_url, "--admin-key-file", str(key_file)]
     own = ["--client-certificate", str(papers.client_certificate), "--client-key", str(papers.client_key)]
-    assert rfm("models", "--ca-file", str(papers.ca), *own, *words).stdout.split() == ["rfm", "1", "READY"]
+    assert rfm("models", "list", "--ca-file", str(papers.ca), *own, *words).stdout.split() == ["rfm", "1", "READY"]
     for credentials in (["--ca-file", str(papers.other_ca), *own], ["--ca-file", str(papers.ca)]):
-        refused = rfm("models", *credentials, *words)
+        refused = rfm("models", "list", *credentials, *words)
         assert (refused.exit_code, refused.stdout) == (1, "")
         assert refused.stderr.startswith(f"rfm: {mutual.grpc_url}: failed to connect")
 

@@ -14,8 +14,6 @@ import threading
 from collections.abc import Sequence
 from contextlib import suppress
 
-from client_commands import RFM_CLIENT
-
 WIDTH = 80
 _LINES = 50
 _CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
@@ -56,10 +54,3 @@ class Terminal:
         with suppress(OSError):  # it is closed
             while part := os.read(self._ours, 4096):
                 self._shown.append(part)
-
-
-def on_terminal(*words: object, width: int = WIDTH) -> tuple[int, list[str]]:
-    """Return the exit code of ``rfm-client`` and the lines on a terminal, with standard error."""
-    with Terminal([str(RFM_CLIENT), *map(str, words)], width) as terminal:
-        code = terminal.process.wait(timeout=60)
-    return code, terminal.shown.split("\n")

@@ -10,13 +10,13 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING
 from enum import IntEnum
-from typing import Annotated, Any, ClassVar, Generic, NoReturn, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Generic, NoReturn, TypeVar, get_args, get_origin
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.models import OptionInfo
 
-from rfm_client.cli.messages import UsageError, argument_name, in_plain_words, same_words, told, write_options
+from rfm_client.cli.messages import UsageError, argument_name, in_plain_words, told, write_options
 from rfm_client.contract import errors
 from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, placeholder_of
 
@@ -115,11 +115,8 @@ class Command(TyperCommand):
             error.message = in_plain_words(error)
             raise
         except UsageError as error:
-            if unknown := getattr(error, "option_name", ""):
-                same = same_words(unknown, [option for each in self.params for option in each.opts])
-                vars(error)["possibilities"] = same or vars(error)["possibilities"]
-                if self.unknown_option and not same:
-                    vars(error)["message"] += f": {self.unknown_option.format(option=unknown)}"
+            if self.unknown_option and (unknown := getattr(error, "option_name", "")):
+                vars(error)["message"] += f": {self.unknown_option.format(option=unknown)}"
             raise
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
@@ -177,14 +174,11 @@ class Commands(CommandGroup):
 
     other_program = "rfm"
     others: Collection[str] = ("export", "serve", "try", "models")
-    renamed: ClassVar[Mapping[str, str]] = {}  # commands of earlier versions, with the names of today
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command. Raises an error of usage with the right name, or the program that has the command."""
         if args[0] in self.others and self.get_command(ctx, args[0]) is None:
             ctx.fail(f"No such command '{args[0]}': that is `{self.other_program} {args[0]}`")
-        if args[0] in self.renamed:
-            ctx.fail(f"No such command '{args[0]}': it is now `{ctx.info_name} {self.renamed[args[0]]}`")
         return super().resolve_command(ctx, args)
 
 

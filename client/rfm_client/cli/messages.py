@@ -6,7 +6,6 @@ No text of libraries, no arguments of Python functions.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import typer
@@ -42,12 +41,6 @@ def in_plain_words(error: typer.BadParameter) -> str:
     if expected is None:
         return error.message.removeprefix("Value error, ")
     return f"expected {expected}, got {details[0]['input']!r}"
-
-
-def same_words(option: str, options: Sequence[str]) -> list[str]:
-    """Return the options with the words of this one in another order."""
-    words = sorted(option.strip("-").split("-"))
-    return [each for each in options if sorted(each.strip("-").split("-")) == words]
 
 
 def write_options(command: Any, ctx: Any, formatter: Any) -> None:
