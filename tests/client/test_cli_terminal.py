@@ -17,7 +17,7 @@ import pytest
 from rich.console import Console
 
 import clip
-from client_commands import MODEL, RFM_CLIENT, TASK, ask, assert_scores
+from client_commands import MODEL, RFM_CLIENT, TASK, WIDTH, ask, assert_scores, on_terminal
 from engine_server import EngineServer
 from rfm_client import FrameScores, ProgressResult
 from rfm_client.cli.documents import frame_document
@@ -29,7 +29,6 @@ from rfm_client.contract.wire import encode_samples
 from rfm_client.serving import ServerStatus
 from rfm_client.transport.status import ModelStatus
 from servers import Endpoints
-from terminals import WIDTH, on_terminal
 
 NAMES = ("episode_a.mp4", "episode_b.mp4")
 
