@@ -16,7 +16,6 @@ from commands import RUN
 from engines import load_engine, serve_config
 from environments import MODEL, LateClient
 from paths import ROOT
-from patients import references  # noqa: F401  a fixture
 from rfm.engine import Engine
 from rfm.serve import access
 from rfm_client import RewardClient

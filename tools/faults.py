@@ -19,6 +19,7 @@ import psutil
 import rfm_export
 from callers import Callers, Exam, direct, through_gateway
 from paths import ROOT
+from repositories import answering
 from rfm.config import ExportConfig
 from rfm.serve.processes import has_ended
 from rfm.serve.repository import MODEL_FILE
@@ -36,15 +37,8 @@ SILENT_S = 10.0  # the default of rfm serve
 GONE_S = 5.0  # until all processes of a killed rfm serve have ended
 IDLE = 1300  # connections; more than the usual limit of descriptors, 1024
 DIES = "import os\n\nos._exit(1)\n"
-LOOP_S = 120.0  # six or more starts of Triton, with back-off
-MODEL_FAULTS = """
-
-_answer = TritonPythonModel.answer
-
-
-def answer(self, questions, execution):
-    import os, time
-
+LOOP_S = 120.0  # six or more starts of Triton
+MODEL_FAULTS = answering("""
     for fault in ("hang", "break"):  # once, by the instance that takes the file
         try:
             os.unlink(f"{folder}/{fault}.{name}")
@@ -57,11 +51,7 @@ def answer(self, questions, execution):
         raise RuntimeError("CUDA error: an illegal memory access was encountered")
     if os.path.exists(f"{folder}/die.{name}"):
         os._exit(1)
-    return _answer(self, questions, execution)
-
-
-TritonPythonModel.answer = answer
-"""
+""")
 
 
 @dataclass

@@ -10,16 +10,43 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import tritonclient.grpc
 
+from callers import WIDTHS
+from commands import in_shared_memory
 from engine_server import EngineServer
-from faulty_servers import heavy, ours_in_dev_shm, regions, trajectory, url_of
 from mixtures import MODEL, assert_same, plug, wait_until_at_work
 from proxies import Proxy
 from repositories import bound_queue, configure
-from rfm_client import DeadlineExceededError, ProgressResult, ProgressSample, RewardClient, ServerUnavailableError
-from servers import Endpoints, OneModelServer, Served
+from rfm_client import (
+    DeadlineExceededError,
+    ProgressResult,
+    ProgressSample,
+    RewardClient,
+    ServerUnavailableError,
+    Trajectory,
+)
+from servers import PATIENCE_S, Endpoints, Served, start_triton
+from trajectories import random_trajectory
 
-PATIENCE_S = 60.0
+
+def trajectory(seed: int, num_frames: int = 8) -> Trajectory:
+    return random_trajectory(seed, num_frames, *WIDTHS)
+
+
+def heavy() -> Trajectory:
+    """Large enough for shared memory."""
+    return trajectory(0, 2000)
+
+
+def regions(endpoints: Endpoints) -> set[str]:
+    """Return the names of the server's mapped regions."""
+    with tritonclient.grpc.InferenceServerClient(endpoints.grpc_url.removeprefix("grpc://")) as client:
+        return set(client.get_system_shared_memory_status().regions)
+
+
+def ours_in_dev_shm() -> set[str]:
+    return {name for name in in_shared_memory() if "rfm-client-" in name}
 
 
 @pytest.fixture
@@ -73,7 +100,7 @@ def test_a_full_queue_is_waited_for(repository: Path) -> None:
     configure(repository / "rfm", batch_size=1)
     bound_queue(repository / "rfm", max_queue_size=1)
     samples = [ProgressSample(trajectory(seed, 32), frame_steps=16) for seed in range(16)]
-    with OneModelServer(repository, Endpoints.free()) as server:
+    with start_triton(repository) as server:
         for url in (server.endpoints.grpc_url, server.endpoints.http_url):
             with RewardClient(url, retry=False) as client:
                 outcomes = client.evaluate(samples, return_errors=True)
@@ -96,12 +123,12 @@ def nothing_shared_is_left(demo_server: Endpoints) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("nothing_shared_is_left")
-def test_shared_memory_changes_no_answer(demo_server: Endpoints, protocol: str) -> None:
+def test_shared_memory_changes_no_answer(served: Served, demo_server: Endpoints, protocol: str) -> None:
     samples = [ProgressSample(heavy(), frame_steps=2), ProgressSample(trajectory(1))]
     mapped, named = regions(demo_server), ours_in_dev_shm()
-    with RewardClient(url_of(demo_server, protocol)) as client:
+    with RewardClient(served.url(protocol)) as client:
         expected = client.evaluate(samples)
-    with RewardClient(url_of(demo_server, protocol), shared_memory=True) as client:
+    with RewardClient(served.url(protocol), shared_memory=True) as client:
         for _ in range(3):
             for answer, plain in zip(client.evaluate(samples), expected, strict=True):
                 assert_same(answer, plain)

@@ -26,7 +26,7 @@ import clip
 from in_process import rfm_parsed
 from paths import ROOT
 from rfm_client import AccessDeniedError, RewardClient, ServerUnavailableError, Trajectory
-from servers import Endpoints, serving, wait_for, web_server
+from servers import Endpoints, Quiet, serving, wait_for, web_server
 from tolerances import TOLERANCE
 
 GUIDE = (ROOT / "docs" / "guides" / "deploy.md").read_text()
@@ -153,15 +153,12 @@ def test_nginx_passes_on_what_scoring_needs_with_a_key_and_nothing_else(nginx: s
 def test_nginx_tells_triton_that_no_body_is_a_form(nginx: str, papers: Path) -> None:
     """With a stand-in for Triton."""
 
-    class Told(BaseHTTPRequestHandler):
+    class Told(Quiet, BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             self.rfile.read(int(self.headers["Content-Length"]))
             self.send_response(200)
             self.send_header("X-Type", self.headers["Content-Type"])
             self.end_headers()
-
-        def log_message(self, *_: object) -> None:
-            pass
 
     key, port = (papers / "keys" / "alice.key").read_text().strip(), Endpoints.free().http_port
     context = ssl.create_default_context(cafile=papers / "keys" / "ca.pem")

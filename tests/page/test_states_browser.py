@@ -14,7 +14,7 @@ from gateways import free_port, running
 from labelling import BrightnessScorer
 from paths import ROOT
 from rfm_labels import LabelOptions, label, open_dataset
-from servers import Endpoints, OneModelServer
+from servers import Endpoints, start_triton
 from shown_datasets import copied, hdf5, large
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
@@ -120,7 +120,7 @@ def test_nothing_to_show_says_what_to_do(browser: Browser, tmp_path: Path) -> No
         assert wait_for_state(browser, place).startswith(title)
 
     with (
-        OneModelServer(tmp_path / "models", Endpoints.free()) as server,
+        start_triton(tmp_path / "models") as server,
         running(server.endpoints, tmp_path, "rfm", *options) as gateway,
     ):
         browser.driver.get(gateway.url)

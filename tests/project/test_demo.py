@@ -106,13 +106,10 @@ def test_a_repository_that_cannot_be_served_is_told(tmp_path: Path) -> None:
     clip.write(tmp_path / "clip.mp4")
     spaced = tmp_path / "my models"
     spaced.symlink_to(REPOSITORY)
-    for repository, told in (
-        (tmp_path / "none", "a folder of models"),
-        (spaced, "a path without spaces, such as a link (ln -s)"),
-    ):
-        result = rfm("try", tmp_path / "clip.mp4", "--task", "x", "--repository", repository, "--output", tmp_path)
-        assert result.exit_code == 1
-        assert result.stderr.startswith(f"rfm: repository: expected {told}, got {repository}")
+    result = rfm("try", tmp_path / "clip.mp4", "--task", "x", "--repository", spaced, "--output", tmp_path)
+    assert result.exit_code == 1
+    expected = "a path without spaces, such as a link (ln -s)"
+    assert result.stderr.startswith(f"rfm: repository: expected {expected}, got {spaced}")
 
 
 @pytest.mark.nightly

@@ -13,14 +13,14 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
-from click import Command, Context, Parameter
+from click import Command, Context
 from typer.main import get_command
 
 import clip
@@ -44,7 +44,6 @@ GUIDES = sorted([*DOCS.glob("guides/*.md"), *DOCS.glob("tutorials/*.md")])
 RUN = (ROOT / "README.md", ROOT / "client" / "README.md", *GUIDES)  # whose examples and client commands are run
 DOCUMENTS = sorted({*ROOT.glob("*.md"), *ROOT.glob("[!.]*/**/*.md")} - {*ROOT.glob("build/**/*.md")})
 README_LINES = 120
-COMPLETION = ("install_completion", "show_completion", "help")  # typer's own
 
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 COMMAND = re.compile(r"^ {4,}(rfm-client [^#\n]*)", re.MULTILINE)
@@ -222,22 +221,6 @@ def parse(command: Command, arguments: Sequence[str], parent: Context | None = N
         parse(subcommands[arguments[end - 1]], arguments[end:], context)
 
 
-def test_every_command_and_option_has_a_help_text() -> None:
-    for name, command in get_command(rfm_app).commands.items():  # type: ignore[attr-defined]
-        assert command.help, name
-        assert list(options(command)), name
-
-
-def options(command: Command) -> Iterator[Parameter]:
-    """Return the options of a command and all subcommands. Check the help texts."""
-    for parameter in command.params:
-        if parameter.param_type_name == "option" and parameter.name not in COMPLETION:
-            assert parameter.help, (command.name, parameter.name)  # type: ignore[attr-defined]
-            yield parameter
-    for subcommand in getattr(command, "commands", {}).values():
-        yield from options(subcommand)
-
-
 def test_every_tensor_of_the_contract_is_documented() -> None:
     contract = CONTRACT.read_text()
     inputs = (*wire.embedding_inputs(1, 1), *wire.frame_inputs(with_views=True))
@@ -250,19 +233,6 @@ def shown_request() -> dict[str, Any]:
     (text,) = re.findall(r"^```json\n(.*?)^```", CONTRACT.read_text(), re.MULTILINE | re.DOTALL)
     request: dict[str, Any] = json.loads(text)
     return request
-
-
-def test_the_request_of_the_contract_is_one_of_two_samples() -> None:
-    types = {"UINT8": np.uint8, "INT32": np.int32, "BYTES": np.object_}
-    tensors = {
-        tensor["name"]: np.array(tensor["data"], types[tensor["datatype"]]).reshape(tensor["shape"])
-        for tensor in shown_request()["inputs"]
-    }
-    assert {spec.name for spec in wire.frame_inputs() if not spec.optional} == set(tensors)
-    first, second = wire.decode_samples(tensors)
-    assert isinstance(first, ProgressSample)
-    assert isinstance(second, PreferenceSample)
-    assert [trajectory.num_frames for trajectory in (*first.trajectories, *second.trajectories)] == [3, 1, 1]
 
 
 def test_the_request_of_the_contract_runs(demo_server: Endpoints) -> None:

@@ -32,6 +32,7 @@ def assert_whole(shown: str, command: Command) -> None:
     for parameter in command.params:
         options = {*parameter.opts, *parameter.secondary_opts}
         assert {option for option in options if option.startswith("--")} <= words, parameter.name
+        assert parameter.param_type_name == "argument" or parameter.help, parameter.name  # type: ignore[attr-defined]
     listed = shown.partition("Commands:")[2]
     assert "..." not in listed
     assert "…" not in shown
@@ -42,6 +43,7 @@ def test_help_is_whole_says_defaults_as_one_writes_them_and_has_an_example_that_
     program, *words = name.split()
     done = CliRunner().invoke(COMMANDS[program], [*words, "--help"], env=COMMON, prog_name=program)
     assert done.exit_code == 0
+    assert COMMANDS[name].help
     assert_whole(done.output, COMMANDS[name])
     shown = " ".join(done.output.split())
     for unwritten in ("None", "<", "factory", "True", "False", "list[", "x>=", ".0;", ".0]", "PosixPath", "2147483647"):

@@ -8,7 +8,7 @@ import importlib
 import re
 import subprocess
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import fields
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -115,35 +115,19 @@ EXTRAS = {
 }
 
 
-def imports(file: Path) -> set[str]:
-    """Return the dotted names of all imports in a file."""
-    found = set()
+def names_imported(file: Path) -> Iterator[tuple[str, str]]:
+    """Yield module and name of each import in a file; an empty name for the module itself."""
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.Import):
-            found |= {name.name for name in node.names}
+            yield from ((name.name, "") for name in node.names)
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{file}: relative import"
-            found |= {node.module or "", *(f"{node.module}.{name.name}" for name in node.names)}
-    return found
-
-
-def names_of_others(file: Path, package: str) -> Iterator[tuple[str, str]]:
-    """Yield module and name of each import from another package of ours."""
-    for node in ast.walk(ast.parse(file.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] in {*FOLDERS} - {package}:
+            assert node.module and node.level == 0, f"{file}: relative import"
             yield from ((node.module, name.name) for name in node.names)
-        elif isinstance(node, ast.Import):
-            yield from ((name.name, "") for name in node.names if name.name.partition(".")[0] in {*FOLDERS} - {package})
 
 
-def _modules_imported(file: Path, known: Collection[str]) -> Iterator[str]:
-    """Those of the known modules that a file imports, or imports names from."""
-    for node in ast.walk(ast.parse(file.read_text())):
-        if isinstance(node, ast.ImportFrom):
-            named = (f"{node.module}.{name.name}" for name in node.names)
-            yield from (name if name in known else str(node.module) for name in named)
-        elif isinstance(node, ast.Import):
-            yield from (name.name for name in node.names)
+def imports(file: Path) -> set[str]:
+    """Return the dotted names of all imports in a file."""
+    return {dotted for module, name in names_imported(file) for dotted in (module, f"{module}.{name}".rstrip("."))}
 
 
 def _module(file: Path) -> str:
@@ -173,16 +157,19 @@ def test_no_modules_import_each_other(package: str) -> None:
     """Not even for types: modules in a circle can only be read, tested and changed together."""
     root = ROOT / FOLDERS[package]
     files = {_module(file.relative_to(root)): file for file in (root / package).rglob("*.py")}
-    needs = {module: {*_modules_imported(file, files)} - {module} for module, file in files.items()}
+    needs: dict[str, set[str]] = {}
+    for module, file in files.items():
+        imported = {dotted if (dotted := f"{of}.{name}") in files else of for of, name in names_imported(file)}
+        needs[module] = imported & files.keys() - {module}
     TopologicalSorter(needs).prepare()  # raises CycleError, which shows a circle
 
 
 @pytest.mark.parametrize("package", (*APPLICATIONS, "rfm_commands"))
 def test_an_application_imports_public_names_alone_and_so_do_importers_of_it(package: str) -> None:
     for file in (ROOT / FOLDERS[package] / package).rglob("*.py"):
-        for module, name in names_of_others(file, package):
+        for module, name in names_imported(file):
             top, _, inner = module.partition(".")
-            if {package, top}.isdisjoint(APPLICATIONS):
+            if top not in {*FOLDERS} - {package} or {package, top}.isdisjoint(APPLICATIONS):
                 continue
             assert inner in PUBLIC[top], f"{file}: {module}"
             assert name in importlib.import_module(module).__all__, f"{file}: {module}.{name}"

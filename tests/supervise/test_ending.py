@@ -12,10 +12,9 @@ import psutil
 import pytest
 
 from commands import is_alive
-from rfm.serve.processes import ProcessGroup, how_it_ended
+from rfm.serve.processes import ProcessGroup
 from servers import PATIENCE_S, children, wait_for
 
-AT_ONCE_S = 10.0  # a model process used to stay for two minutes
 GROUP = """
 import ctypes, os, sys, time
 from rfm.serve.processes import ProcessGroup
@@ -63,7 +62,3 @@ def test_a_process_that_cannot_start_leaves_no_sentinel() -> None:
     with pytest.raises(FileNotFoundError):
         ProcessGroup(["/nowhere/program"])
     assert set(children(os.getpid())) <= before
-
-
-def test_a_signal_is_called_by_its_name() -> None:
-    assert [how_it_ended(status) for status in (-9, 1)] == ["killed by SIGKILL", "exit status 1"]

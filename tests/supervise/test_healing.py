@@ -9,15 +9,14 @@ import signal
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import psutil
 import pytest
 
 import stand_in_triton
+from callers import Callers, Exam, direct
 from commands import is_alive, running
-from patients import answering, calling, make_repository
+from repositories import answering, make_repository
 from rfm.serve.processes import SHARED_MEMORY, clear_shared_memory
 from rfm.serve.status import NO_REASON
 from servers import (
@@ -41,17 +40,18 @@ HANG_S = 2
 AT_ONCE_S = 10.0  # a model process used to stay for two minutes
 
 
-def test_what_dies_or_hangs_is_healed_and_no_call_is_lost(
-    tmp_path: Path, references: list[np.ndarray[Any, Any]]
-) -> None:
+def test_what_dies_or_hangs_is_healed_and_no_call_is_lost(tmp_path: Path) -> None:
     """tests/supervise/test_supervisor.py has the other faults."""
     trigger = tmp_path / "trigger"
     once = f"os.path.exists({str(trigger)!r}) and os.unlink({str(trigger)!r}) is None"
-    repository = make_repository(tmp_path, more_code=answering(f"if {once}: time.sleep(3600)"))
+    repository = make_repository(tmp_path, answering(f"if {once}: time.sleep(3600)"))
+    exam = Exam.of(repository / MODEL / "1" / "checkpoint", mixed=True)
     with (
         administered(repository, hang_s=HANG_S) as served,
         served.client() as client,
-        calling(client, references) as callers,
+        Callers(
+            direct(client), exam, count=16, pause_s=0.05
+        ) as callers,  # without a pause, they would slow the restart
     ):
         for number, is_hung in enumerate((False, True), 1):
             if is_hung:

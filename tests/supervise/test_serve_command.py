@@ -22,7 +22,8 @@ import torch
 import clip
 import rfm_export
 import stand_in_triton
-from commands import EXIT_S, REPOSITORY, RFM, command, is_alive, nothing_left_behind, wait_for_http
+from client_commands import Terminal
+from commands import EXIT_S, REPOSITORY, RFM, command, is_alive, nothing_left_behind
 from in_process import rfm
 from paths import ROOT
 from rfm.config import ExportConfig
@@ -32,8 +33,7 @@ from rfm.serve.installation import ServerStartError, find_installation
 from rfm.serve.triton_server import Endpoints, TritonServer, short_spin
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_client.contract.process import MOST
-from servers import children, model_processes, wait_for
-from terminals import Terminal
+from servers import PATIENCE_S, children, model_processes, wait_for
 
 VIDEO = ROOT / "tests/videos/jaco_play_pick_up_green_cup.mp4"
 TRY = ["try", str(VIDEO), f"--repository={REPOSITORY}", f"--task={clip.TASK}"]
@@ -247,8 +247,8 @@ def test_a_plain_tritonserver_serves_the_repository_too(tmp_path: Path) -> None:
     with (tmp_path / "log").open("wb") as log, nothing_left_behind():
         process = subprocess.Popen([triton.executable, *arguments], env=environment, stdout=log, stderr=log)
         try:
-            wait_for_http(process, endpoints)
             with RewardClient(endpoints.http_url) as client:
+                client.wait_ready(PATIENCE_S)
                 result = client.progress(Trajectory(frames=clip.render()[::8], task=clip.TASK))
             assert np.isfinite(result.progress).all()
         finally:

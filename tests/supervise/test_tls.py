@@ -20,13 +20,25 @@ import numpy as np
 import pytest
 
 import goldens
-from engines import load_engine
+import rfm_export
+from engines import load_engine, serve_config
 from gateways import inside
 from in_process import rfm, rfm_client
 from rfm_client import AccessDeniedError, ProgressSample, RewardClient, ServerUnavailableError
 from rfm_client.serving import Credentials, ServerStatus
 from secured import PUBLIC_HOST, Papers, other_program
-from servers import KEY, PATIENCE_S, Endpoints, GrpcTls, Serving, serving, start_triton, wait_for, web_server
+from servers import (
+    KEY,
+    PATIENCE_S,
+    Endpoints,
+    GrpcTls,
+    Quiet,
+    Serving,
+    serving,
+    start_triton,
+    wait_for,
+    web_server,
+)
 from tolerances import TOLERANCE
 from trajectories import random_trajectory
 
@@ -48,6 +60,13 @@ def scores_right(asked: RewardClient) -> None:
     expected = load_engine(PLAIN.name).evaluate([ProgressSample(TRAJECTORY)])[0]
     got = asked.progress(TRAJECTORY)
     np.testing.assert_allclose(got.progress, expected.progress, atol=TOLERANCE)  # type: ignore[union-attr]
+
+
+@pytest.fixture(scope="module")
+def repository(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("exposed") / "model_repository"
+    rfm_export.export(PLAIN.checkpoint, folder, serve_config(PLAIN))
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -94,26 +113,22 @@ def test_a_client_without_tls_is_told(secure: Endpoints, scheme: str) -> None:
     assert f" without TLS, got TLS: use {url.replace(scheme, f'{scheme}s')}" in str(caught.value)
 
 
-def test_a_client_without_a_certificate_hears_nothing(mutual: Endpoints, proxied: str, papers: Papers) -> None:
+def test_a_client_without_tls_or_a_certificate_gets_no_connection(
+    mutual: Endpoints, proxied: str, papers: Papers
+) -> None:
     """Triton hangs up, and the proxy at one moment or another."""
+    unavailable, ca = ServerUnavailableError, {"ca_file": papers.ca}
     for url, options, raised in (
-        (mutual.grpc_url, {}, ServerUnavailableError),
-        (proxied, {"api_key": KEY}, (AccessDeniedError, ServerUnavailableError)),
+        (mutual.grpc_url, ca, unavailable),
+        (proxied, {**ca, "api_key": KEY}, (AccessDeniedError, unavailable)),
+        (mutual.grpc_url.replace("grpcs", "grpc"), {}, unavailable),
+        (f"grpcs://127.0.0.1:{mutual.http_port}", ca, unavailable),
+        (f"https://127.0.0.1:{mutual.http_port}", ca, unavailable),
     ):
-        with client(url, ca_file=papers.ca, retry=False, **options) as asked:
+        with client(url, retry=False, **options) as asked:
             with pytest.raises(raised):
                 asked.progress(TRAJECTORY)
             assert not asked.is_ready()
-
-
-def test_tls_on_one_side_alone_gives_no_connection(mutual: Endpoints, papers: Papers) -> None:
-    for url, options in (
-        (mutual.grpc_url.replace("grpcs", "grpc"), {}),
-        (f"grpcs://127.0.0.1:{mutual.http_port}", {"ca_file": papers.ca}),
-        (f"https://127.0.0.1:{mutual.http_port}", {"ca_file": papers.ca}),
-    ):
-        with client(url, retry=False, **options) as asked, pytest.raises(ServerUnavailableError):
-            asked.progress(TRAJECTORY)
 
 
 def test_the_gateway_beside_tls_listens_on_loopback_alone(mutual: Endpoints) -> None:
@@ -135,7 +150,7 @@ def test_rfm_models_shows_a_certificate(mutual: Endpoints, papers: Papers, key_f
         assert refused.stderr.startswith(f"rfm: {mutual.grpc_url}: failed to connect")
 
 
-class Proxy(BaseHTTPRequestHandler):
+class Proxy(Quiet, BaseHTTPRequestHandler):
     """An HTTPS proxy like nginx or an ingress that asks for a certificate and a key."""
 
     protocol_version = "HTTP/1.1"
@@ -160,9 +175,6 @@ class Proxy(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         self.do_POST()
-
-    def log_message(self, *_: object) -> None:
-        pass
 
 
 @pytest.fixture(scope="module")

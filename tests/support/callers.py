@@ -77,11 +77,6 @@ def numbers(result: object) -> Numbers:
     return np.concatenate([[result.similarity], result.reference.progress, result.other.progress])  # type: ignore[attr-defined]
 
 
-def progress_of(client: RewardClient) -> Ask:
-    """Return a caller that asks for progress alone."""
-    return lambda sample: client.progress(sample.trajectories[0]).progress
-
-
 def direct(client: RewardClient) -> Ask:
     """Return a caller with the client's default settings."""
     return lambda sample: numbers(client.evaluate([sample])[0])

@@ -31,16 +31,9 @@ def render() -> UInt8Array:
 
 def write(file: Path, frames: UInt8Array | None = None, fps: int = FPS) -> None:
     """Writes the clip, or other frames, as a video file."""
-    import av
+    from encoding import encode_here
 
-    with av.open(str(file), "w") as container:
-        stream = container.add_stream("libx264", rate=Fraction(fps))
-        images = render() if frames is None else frames
-        stream.height, stream.width = images.shape[1:3]
-        stream.pix_fmt = "yuv420p"
-        for image in images:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-        container.mux(stream.encode())
+    encode_here(file, render() if frames is None else frames, rate=Fraction(fps))
 
 
 def _frame(time: float) -> UInt8Array:

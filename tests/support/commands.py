@@ -5,20 +5,17 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import psutil
 
 from paths import ROOT
 from rfm.serve.access import Endpoints
 from rfm.serve.processes import REGION_PREFIX, SHARED_MEMORY, has_ended
-from rfm_client import RewardClient
 
 REPOSITORY = ROOT / "model_repository"
 RFM = Path(sys.executable).parent / "rfm"
@@ -86,9 +83,3 @@ def nothing_left_behind() -> Iterator[None]:
         assert time.monotonic() < ends_s, (tritons() - tritons_before, left)
         time.sleep(0.02)
         left &= in_shared_memory()
-
-
-def wait_for_http(process: subprocess.Popen[Any], endpoints: Endpoints) -> None:
-    with RewardClient(endpoints.http_url) as client:
-        while not client.is_ready():
-            assert process.poll() is None, process.communicate()

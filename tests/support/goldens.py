@@ -289,6 +289,18 @@ def check(result: Result, expected: Expected, tolerances: tuple[float, float]) -
     assert probability <= tolerances[1]
 
 
+def assert_close(left: object, right: object, tolerance: float) -> None:
+    """Progress, success, preference and similarity of two results are equal within a tolerance."""
+    assert not isinstance(left, Exception), left
+    assert not isinstance(right, Exception), right
+    for a, b in zip(frame_scores(left), frame_scores(right), strict=True):  # type: ignore[arg-type]
+        np.testing.assert_allclose(a.progress, b.progress, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(a.success, b.success, rtol=0, atol=tolerance)
+    for name in ("preference", "similarity"):
+        if hasattr(left, name):
+            assert abs(getattr(left, name) - getattr(right, name)) <= tolerance
+
+
 def frame_scores(result: Result) -> list[FrameScores]:
     """Return the scores of each trajectory of a sample."""
     if isinstance(result, ProgressResult):

@@ -12,7 +12,7 @@ from pathlib import Path
 from unittest import mock
 from urllib.parse import unquote
 
-from servers import web_server
+from servers import Quiet, web_server
 
 
 def commit_of(revision: str) -> str:
@@ -27,19 +27,13 @@ def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") ->
     kind: ``models`` or ``datasets``. All revisions but main are tags
     """
 
-    class Handler(BaseHTTPRequestHandler):
+    class Handler(Quiet, BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            self._answer(with_body=True)
-
-        def do_HEAD(self) -> None:
-            self._answer(with_body=False)
-
-        def _answer(self, *, with_body: bool) -> None:
             place = "" if kind == "models" else f"/{kind}"
             words = self.path.removeprefix(f"/api/{kind}" if self.path.startswith("/api/") else place).split("/")
             repository = "/".join(words[1:3])
             if repository not in repositories:  # a question of newer clients to the Hub itself
-                self._send(404, b"", with_body)
+                self._send(404, b"")
                 return
             revisions = repositories[repository]
             folders = {**revisions, **{commit_of(name): folder for name, folder in revisions.items()}}
@@ -50,43 +44,42 @@ def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") ->
                     for name in revisions
                     if name != "main"
                 ]
-                self._send(200, json.dumps({"branches": [], "converts": [], "tags": tags}).encode(), with_body)
+                self._send(200, json.dumps({"branches": [], "converts": [], "tags": tags}).encode())
             elif self.path == api or self.path.startswith(f"{api}/revision/"):
                 revision = self.path.removeprefix(f"{api}/revision/") if self.path != api else "main"
                 if revision not in folders:
-                    self._send(404, b"", with_body, {"X-Error-Code": "RevisionNotFound"})
+                    self._send(404, b"", {"X-Error-Code": "RevisionNotFound"})
                     return
                 folder = folders[revision]
                 names = [str(file.relative_to(folder)) for file in sorted(folder.rglob("*")) if file.is_file()]
                 siblings = [{"rfilename": name} for name in names]
                 told = {"id": repository, "sha": _commit(revisions, revision), "siblings": siblings}
-                self._send(200, json.dumps(told).encode(), with_body)
+                self._send(200, json.dumps(told).encode())
             elif self.path.startswith(f"{api}/tree/"):
                 revision = self.path.removeprefix(f"{api}/tree/").partition("?")[0]
                 told = [_told(file, folders[revision]) for file in folders[revision].rglob("*") if file.is_file()]
-                self._send(200, json.dumps(told).encode(), with_body)
+                self._send(200, json.dumps(told).encode())
             else:
                 revision, _, name = self.path.removeprefix(files).partition("/")
                 file = folders[revision] / unquote(name)
                 if not file.is_file():
                     of_commit = {"X-Repo-Commit": _commit(revisions, revision)}
-                    self._send(404, b"", with_body, {"X-Error-Code": "EntryNotFound", **of_commit})
+                    self._send(404, b"", {"X-Error-Code": "EntryNotFound", **of_commit})
                     return
                 content = file.read_bytes()
                 etag = f'"{hashlib.sha1(content).hexdigest()}"'
-                self._send(200, content, with_body, {"ETag": etag, "X-Repo-Commit": _commit(revisions, revision)})
+                self._send(200, content, {"ETag": etag, "X-Repo-Commit": _commit(revisions, revision)})
 
-        def _send(self, status: int, body: bytes, with_body: bool, headers: Mapping[str, str] | None = None) -> None:
+        do_HEAD = do_GET  # noqa: N815  the name that http.server asks for
+
+        def _send(self, status: int, body: bytes, headers: Mapping[str, str] | None = None) -> None:
             self.send_response(status)
             for name, value in (headers or {}).items():
                 self.send_header(name, value)
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
-            if with_body:
+            if self.command == "GET":
                 self.wfile.write(body)
-
-        def log_message(self, format: str, *args: object) -> None:
-            """Keeps the test's output clean."""
 
     with web_server(Handler) as url:
         yield url

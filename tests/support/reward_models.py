@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from google.protobuf import text_format
-from tritonclient.grpc.model_config_pb2 import ModelConfig
 
 from paths import GOLDEN
+from repositories import changing
 from rfm_client import ProgressSample, Trajectory
 from rfm_client.contract.description import DESCRIPTION_PARAMETER
 from rfm_export.layout import description_in
@@ -68,9 +67,8 @@ def references(section: str) -> list[Reference]:
 
 def as_before_marks(file: Path) -> None:
     """Remove the marks from a configuration, as in an export without them."""
-    config = text_format.Parse(file.read_text(), ModelConfig())
-    (index,) = (index for index, output in enumerate(config.output) if output.name == "unclear")
-    del config.output[index]
-    described = replace(description_in(config), more_scores=())
-    config.parameters[DESCRIPTION_PARAMETER].string_value = described.to_json()
-    file.write_text(text_format.MessageToString(config))
+    with changing(file.parent) as config:
+        (unclear,) = (output for output in config.output if output.name == "unclear")
+        config.output.remove(unclear)
+        described = replace(description_in(config), more_scores=())
+        config.parameters[DESCRIPTION_PARAMETER].string_value = described.to_json()

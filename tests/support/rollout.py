@@ -21,6 +21,7 @@ import torch
 
 import goldens
 import rfm_export
+from callers import numbers
 from engines import serve_config
 from rfm import published
 from rfm.engine import Engine, Outcome
@@ -40,7 +41,6 @@ NAME = "rfm"
 WITH_ENCODERS = goldens.config("enc_c1_t1_disc10")
 WIDTHS = (48, 32)
 FRAME_PX = 48
-CLEARLY = 1e-2  # the least difference between versions
 CALLERS = 8  # more would slow down the loading
 PAUSE_S = 0.2  # a control loop's step
 
@@ -111,12 +111,6 @@ def answers(checkpoint: Path, samples: Sequence[Sample]) -> list[Outcome]:
     serve = serve_config(WITH_ENCODERS)
     loaded = published.read(checkpoint, image_encoder=serve.image_encoder, text_encoder=serve.text_encoder)
     return Engine.of(loaded.checkpoint, encoders=loaded.encoders()).evaluate(samples)
-
-
-def numbers(outcome: object) -> np.ndarray:
-    """Return progress and success of the (first) trajectory."""
-    scores = getattr(outcome, "first", outcome)
-    return np.concatenate([scores.progress, scores.success])  # type: ignore[attr-defined]
 
 
 def difference(left: object, right: object) -> float:

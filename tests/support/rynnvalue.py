@@ -7,7 +7,6 @@ import json
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -75,15 +74,15 @@ class Case(Reference):
             frames = np.clip(arrays[trajectory["frames"]["__numpy_file__"]], 0, 255).astype(np.uint8)
             steps = FRAME_STEPS if request["use_frame_steps"] else 0
             told = trajectory.get("metadata")
-            meta = SOURCES[trajectory["data_source"]] if not told else _descriptions(told)
+            meta = (
+                (told.get("robot_description"), told.get("camera_description"))
+                if told
+                else SOURCES[trajectory["data_source"]]
+            )
             shown = ProgressSample(Trajectory(frames=frames, task=trajectory["task"]), steps)
             meta = meta if self.summary["use_meta"] else UNSAID
             found.append(Asked(shown, f"sample_{index}.", self.checkpoint, meta))
         return found
-
-
-def _descriptions(metadata: dict[str, Any]) -> Meta:
-    return metadata.get("robot_description"), metadata.get("camera_description")
 
 
 def said(meta: Meta) -> dict[str, str | None]:

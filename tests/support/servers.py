@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import ssl
@@ -21,7 +20,6 @@ from typing import Any
 
 import httpx
 import psutil
-import tritonclient.grpc
 from prometheus_client.parser import text_string_to_metric_families
 
 import goldens
@@ -82,39 +80,6 @@ def start_triton(
         yield server
 
 
-class OneModelServer(BriefServer):
-    """A server of the demo's ``rfm`` alone; with more arguments, and killed if asked."""
-
-    def __init__(self, repository: Path, endpoints: Endpoints, *arguments: str) -> None:
-        log = (repository.parent / "tritonserver.log").open("ab")
-        super().__init__(repository, endpoints, find_installation(), log=log, more_arguments=arguments)
-        self._own_log = log
-
-    def signal(self, number: signal.Signals) -> None:
-        os.killpg(os.getpgid(self.pid), number)
-
-    def kill(self) -> None:
-        super().kill()
-        self.stop()
-
-    def __enter__(self) -> TritonServer:
-        try:
-            return super().__enter__()
-        except BaseException:
-            self._own_log.close()
-            raise
-
-    def __exit__(self, *raised: Any) -> None:
-        super().__exit__(*raised)
-        self._own_log.close()  # not in `stop`: a start that Triton has spoilt is stopped and repeated
-
-
-def answered(endpoints: Endpoints) -> int:
-    with tritonclient.grpc.InferenceServerClient(endpoints.grpc_url.removeprefix("grpc://")) as client:
-        stats = client.get_inference_statistics("rfm").model_stats[0]
-    return int(stats.inference_stats.success.count)
-
-
 @dataclass(frozen=True)
 class Served:
     """A running server with every reference checkpoint by name."""
@@ -132,6 +97,9 @@ class Served:
     def url(self, protocol: str) -> str:
         return self.endpoints.grpc_url if protocol == "grpc" else self.endpoints.http_url
 
+    def api(self) -> RepositoryApi:
+        return RepositoryApi(self.endpoints.grpc_url, self.server.admin_key)
+
     def client(self, protocol: str, model: str = "c1_t1_disc10") -> RewardClient:
         self.has(model)
         return RewardClient(self.url(protocol), model=model)
@@ -143,7 +111,7 @@ class Served:
             rfm_export.export(
                 goldens.config(name).checkpoint, self.repository, serve_config(goldens.config(name), name)
             )
-            with RepositoryApi(self.url("grpc"), self.server.admin_key) as api:
+            with self.api() as api:
                 for model in sorted(set(self.repository.iterdir()) - before):
                     api.load(model.name)
 
@@ -279,11 +247,15 @@ def administered(repository: Path, *more: str, **settings: int) -> Iterator[Serv
     assert KEY not in served.log.read_text(errors="replace")
 
 
-class FolderRequest(SimpleHTTPRequestHandler):
-    """Answers with a file of the folder ``directory``, and logs nothing."""
+class Quiet:
+    """A part of handlers that log no requests."""
 
     def log_message(self, format: str, *args: object) -> None:
         pass
+
+
+class FolderRequest(Quiet, SimpleHTTPRequestHandler):
+    """Answers with a file of the folder ``directory``."""
 
 
 @contextmanager

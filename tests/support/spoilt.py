@@ -169,17 +169,12 @@ def text_settings(**changes: Any) -> Spoil:
     return in_json("config.json", lambda content: content["text_config"].update(changes))
 
 
-def conversion(load: Callable[[Path], object], folder: Path) -> str:
-    """Return the command in the refusal of ``load``."""
+def convert(load: Callable[[Path], object], folder: Path) -> None:
+    """Run the shell command from the refusal of ``load`` in this process."""
     with pytest.raises(CheckpointError) as refusal:
         load(folder)
     (command,) = re.findall(r"python -c .*", str(refusal.value))
-    return str(command)
-
-
-def convert(load: Callable[[Path], object], folder: Path) -> None:
-    """Run the shell command from the refusal of ``load`` in this process."""
-    _, _, code, *arguments = shlex.split(conversion(load, folder))
+    _, _, code, *arguments = shlex.split(command)
     with mock.patch.object(sys, "argv", ["-c", *arguments]):
         exec(code, {})
 

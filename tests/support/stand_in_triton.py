@@ -24,8 +24,6 @@ CONFIG = {
     "input": [{"name": "num_frames", "dims": [2]}, {"name": "sample_type", "dims": [1]}],
     "output": [{"name": "progress"}],
 }
-
-
 CONFIG_FILE = 'name: "%s"\nbackend: "python"\nversion_policy { specific { versions: 1 } }\n'
 
 

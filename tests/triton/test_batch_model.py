@@ -151,28 +151,26 @@ def slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Slow:
 
 def test_a_cancelled_request_is_not_scored(slow: Slow) -> None:
     """Also after a split batch whose last request took no time."""
-    model = slow
-    model.seconds = 1.5 * ASKING_S
-    model.respond(request(1), request(BREAKS))
-    cancelled, scored = model.respond(request(5, is_given_up=True), request(6))
+    slow.seconds = 1.5 * ASKING_S
+    slow.respond(request(1), request(BREAKS))
+    cancelled, scored = slow.respond(request(5, is_given_up=True), request(6))
     assert cancelled.error == ("cancelled", "cancelled by the client")
     assert scored.error is None
-    (scored,) = model.respond(request(5, is_given_up=True))  # asking would take longer than a batch that took no time
+    (scored,) = slow.respond(request(5, is_given_up=True))  # asking would take longer than a batch that took no time
     assert scored.error is None
-    assert model.samples[("progress", "cancelled")] == 1
+    assert slow.samples[("progress", "cancelled")] == 1
 
 
 def test_all_cancelled_requests_ahead_of_the_others_are_dropped_behind_a_short_batch(slow: Slow) -> None:
     """Asking behind a living request is worth it only behind a long batch."""
-    model = slow
-    model.seconds = 1.5 * ASKING_S
-    model.respond(request(1, 1))
+    slow.seconds = 1.5 * ASKING_S
+    slow.respond(request(1, 1))
     asked = [request(5, is_given_up=True), request(6, is_given_up=True), request(7), request(8, is_given_up=True)]
-    assert [response.error is None for response in model.respond(*asked)] == [False, False, True, True]
-    model.seconds = 5 * ASKING_S
-    model.respond(request(1, 1))
+    assert [response.error is None for response in slow.respond(*asked)] == [False, False, True, True]
+    slow.seconds = 5 * ASKING_S
+    slow.respond(request(1, 1))
     asked = [request(7), request(8, is_given_up=True)]
-    assert [response.error is None for response in model.respond(*asked)] == [True, False]
+    assert [response.error is None for response in slow.respond(*asked)] == [True, False]
 
 
 def test_a_request_without_samples_is_refused(tmp_path: Path) -> None:

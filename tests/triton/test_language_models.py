@@ -36,7 +36,7 @@ from paths import VIDEOS
 from reward_models import ROOT, Reference, references
 from rfm import published
 from rfm.config import ExportConfig
-from rfm.engine import Engine
+from rfm.engine import Engine, Outcome
 from rfm_client import (
     InvalidSampleError,
     ModelNotFoundError,
@@ -46,7 +46,6 @@ from rfm_client import (
     RewardClient,
     Trajectory,
 )
-from rfm_client.contract import FRAME_SCORES
 from rfm_rl import RewardModelWrapper, RewardOptions
 from robodopamine import case_named
 from servers import Endpoints, start_triton
@@ -68,6 +67,7 @@ MODELS: dict[str, tuple[Path, dict[str, Any]]] = {
     "forward": (robodopamine.CHECKPOINT, {"reward_model": "robodopamine,mode=forward"}),
 }
 TASK = "put the red block in the bowl"
+UNCLEAR, CLEAR = "fallback_digits_T2", "score5_T4"  # answers: 'Score 2 of 5', 'ANSWER: 5'
 VIDEO = VIDEOS / "jaco_play_pick_up_green_cup.mp4"
 
 
@@ -97,30 +97,52 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         yield Served(server.url)
 
 
+def samples_of(name: str) -> list[ProgressSample]:
+    """Return samples of reference cases for a model: of different lengths, with and without views, dense or not."""
+    if name == "rynn":
+        asked = rynnvalue_case("B3_ragged").asked()
+        return [*(each.sample for each in asked), ProgressSample(asked[1].sample.trajectory, 8)]
+    if name == "forward":
+        return [case_named(each).sample for each in ("forward_T5", "forward_T4_odd_size", "baseline_T3_forward")]
+    names = {"top": ("T8_48x80", "B2_T4"), "robo": ("batch_B3", UNCLEAR, CLEAR)}[name]
+    section = MODELS[name][1]["reward_model"]
+    return [sample for each in names for sample in case(section, each).samples()]
+
+
+def assert_equal_scores(got: Outcome, expected: Outcome) -> None:
+    assert isinstance(got, ProgressResult), got
+    assert isinstance(expected, ProgressResult), expected
+    assert got.arrays.keys() == expected.arrays.keys()
+    for name, array in expected.arrays.items():
+        np.testing.assert_allclose(got.arrays[name], array, rtol=1e-4, atol=1e-4, err_msg=name)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_server_answers_as_the_engine_does(asked: Served, name: str) -> None:
+    checkpoint, settings = MODELS[name]
+    samples, engine = samples_of(name), Engine.of(published.load(checkpoint, **settings))
+    with asked.client(name) as client:
+        asked_for = {"all_scores": True, "logits": name == "robo"}
+        together, alone = client.evaluate(samples, **asked_for), client.evaluate(samples[:1], **asked_for)
+    expected = engine.evaluate(samples)
+    for outcome, wanted in zip((*together, *alone), (*expected, expected[0]), strict=True):
+        assert_equal_scores(outcome, wanted)
+
+
 @pytest.mark.nightly
 @pytest.mark.triton
 def test_triton_answers_the_same(asked: Served, tmp_path: Path) -> None:
     repository = tmp_path / "model_repository"
     for name, (checkpoint, settings) in MODELS.items():
         rfm_export.export(checkpoint, repository, ExportConfig(name=name, num_gpus=0, **settings))
-    samples = {
-        "top": case("topreward", "B2_T4").samples(),
-        "robo": case("roboreward", "batch_B3").samples(),
-        "rynn": [each.sample for each in rynnvalue_case("B3_ragged").asked()],
-        "forward": [case_named("forward_T5").sample],
-    }
     with start_triton(repository) as server:
         for url in (server.endpoints.grpc_url, server.endpoints.http_url):
             for name in MODELS:
                 with asked.client(name) as here, RewardClient(url, model=name) as client:
-                    expected, results = (each.evaluate(samples[name], all_scores=True) for each in (here, client))
+                    expected, got = (each.evaluate(samples_of(name), all_scores=True) for each in (here, client))
                     assert client.model_info(frames=True) == here.model_info(frames=True)
-                for left, right in zip(expected, results, strict=True):
-                    for score in FRAME_SCORES:
-                        values = (getattr(left, score), getattr(right, score))
-                        assert (values[0] is None) == (values[1] is None), score
-                        if values[0] is not None:
-                            np.testing.assert_allclose(*values, rtol=1e-4, atol=1e-4, err_msg=score)
+                for left, right in zip(expected, got, strict=True):
+                    assert_equal_scores(right, left)
 
 
 def case(section: str, name: str) -> Reference:
@@ -137,86 +159,32 @@ def body(samples: list[ProgressSample], **more: bool) -> dict[str, Any]:
     return {"samples": [{"sample_type": "progress", "trajectory": each} for each in told], **more}
 
 
-def test_topreward_is_answered_as_by_the_engine(asked: Served) -> None:
-    samples = [sample for name in ("T8_48x80", "B2_T4") for sample in case("topreward", name).samples()]
-    engine = Engine.of(published.load(str(TOP), reward_model="topreward"))
+def test_what_a_model_does_not_predict_is_none_or_an_error(asked: Served) -> None:
     with asked.client("top") as client:
-        results = client.evaluate(samples, log_prob=True)
-        plain, full = client.evaluate(samples), client.evaluate(samples, all_scores=True)
-    for result, without, every, expected in zip(results, plain, full, engine.evaluate(samples), strict=True):
-        assert isinstance(every, ProgressResult)
-        assert isinstance(result, ProgressResult)
-        assert isinstance(without, ProgressResult)
-        assert isinstance(expected, ProgressResult)
-        assert result.log_prob is not None
-        np.testing.assert_allclose(result.log_prob, expected.log_prob, rtol=0, atol=2e-5)
-        np.testing.assert_allclose(result.progress, expected.progress, rtol=0, atol=1e-4)
-        assert without.log_prob is None
-        assert every.log_prob is not None
-        np.testing.assert_allclose(every.log_prob, expected.log_prob, rtol=0, atol=2e-5)
-        assert np.isnan(result.success).all()
-
-
-def test_remaining_seconds_are_those_of_the_original(asked: Served) -> None:
-    told = rynnvalue_case("B3_ragged")
-    samples = told.asked()
+        (plain,) = client.evaluate(samples_of("top")[:1])
     with asked.client("rynn") as client:
-        results = client.evaluate([each.sample for each in samples])
-        (dense,) = client.evaluate([ProgressSample(samples[1].sample.trajectory, 8)])
-    for each, result in zip(samples, results, strict=True):
-        assert isinstance(result, ProgressResult)
-        seconds = told.expected(each.prefix, "value.pred_value")
-        np.testing.assert_allclose(result.remaining_s, seconds, rtol=2e-4, atol=2e-4)
-        assert np.isnan(result.progress).all()
-        assert np.isnan(result.success).all()
-        assert result.relative_s is not None
-        assert result.relative_s[0] == 0
-        assert result.entropy is not None
-        with pytest.raises(ValueError, match="this checkpoint does not predict it"):
-            _ = result.last_progress
-        shares = result.progress_by("remaining_over_first")
-        np.testing.assert_allclose(shares, (1 - seconds / seconds[0]).clip(0, 1), rtol=0, atol=1e-3)
-    assert isinstance(dense, ProgressResult)
-    assert dense.remaining_s is not None
-    assert len(dense.remaining_s) == 3
-
-
-def test_samples_with_and_without_views_are_answered_as_by_the_engine(asked: Served) -> None:
-    names = ("forward_T5", "forward_T4_odd_size", "baseline_T3_forward")
-    samples = [case_named(name).sample for name in names]
+        (timed,) = client.evaluate(samples_of("rynn")[:1])
     with asked.client("forward") as client:
-        together, alone = client.evaluate(samples), [client.progress(each.trajectory) for each in samples]
-    for expected, *results in zip(case_named(names[0]).engine().evaluate(samples), together, alone, strict=True):
-        assert isinstance(expected, ProgressResult), expected
-        for result in results:
-            assert isinstance(result, ProgressResult), result
-            np.testing.assert_array_equal(result.progress, expected.progress)
-            np.testing.assert_array_equal(result.hop, expected.hop)
-            assert result.is_answered.tolist() == [False, *[True] * (len(result.progress) - 1)]
-            assert result.last_progress == expected.progress[-1]
-            with pytest.raises(
-                ValueError, match=r"progress: expected a score of each frame, got NaN: the model answered"
-            ):
-                _ = result.progress_deltas
+        (skipping,) = client.evaluate(samples_of("forward")[:1])
+    assert isinstance(plain, ProgressResult)
+    assert isinstance(timed, ProgressResult)
+    assert isinstance(skipping, ProgressResult)
+    assert plain.log_prob is None
+    with pytest.raises(ValueError, match="this checkpoint does not predict it"):
+        _ = timed.last_progress
+    assert skipping.is_answered.tolist() == [False, *[True] * (len(skipping.progress) - 1)]
+    with pytest.raises(ValueError, match=r"progress: expected a score of each frame, got NaN: the model answered"):
+        _ = skipping.progress_deltas
 
 
-def test_roboreward_is_answered_as_by_the_original(asked: Served) -> None:
-    told, steps_told = case("roboreward", "batch_B3"), case("roboreward", "steps_T4_T1")
-    task, frames = steps_told.samples()[0].trajectory.task, steps_told.samples()[0].trajectory.positions
+def test_steps_of_an_episode_are_those_of_the_original(asked: Served) -> None:
+    told = case("roboreward", "steps_T4_T1")
+    task, frames = told.samples()[0].trajectory.task, told.samples()[0].trajectory.positions
     with asked.client("robo") as client, client.episode(task, sampling="all") as episode:
-        results = client.evaluate(told.samples(), logits=True)
         steps = [episode.add(frame).progress for frame in frames]
-    for result, progress, text in zip(
-        results, told.content["compute_progress"], told.content["generations"], strict=True
-    ):
-        assert isinstance(result, ProgressResult)
-        assert result.progress_logits is not None
-        np.testing.assert_array_equal(result.progress, np.float32(progress))
-        np.testing.assert_allclose(result.progress_logits[0], text["digit_logits_at_answer"], rtol=0, atol=0.3)
-    assert steps == steps_told.content["response"]["outputs_progress"]["progress_pred"][0]
+    assert steps == told.content["response"]["outputs_progress"]["progress_pred"][0]
 
 
-UNCLEAR, CLEAR = "fallback_digits_T2", "score5_T4"  # answers: 'Score 2 of 5', 'ANSWER: 5'
 SAID = "2 of 2 frames: the model's written answer states no single whole score"
 
 
@@ -449,16 +417,6 @@ def labelled(asked: Served, folder: Path, sample: ProgressSample, model: str, *w
     np.save(folder / "b.npy", sample.trajectory.positions)
     asked.command(*command, model=model)
     return parquet.read_table(folder / "reward_signals" / "own.parquet")
-
-
-def test_labels_are_nan_at_frames_without_an_answer(asked: Served, tmp_path: Path) -> None:
-    case = case_named("baseline_T3_forward")
-    (expected,) = case.engine().evaluate([case.sample])
-    assert isinstance(expected, ProgressResult)
-    signals = labelled(asked, tmp_path / "data", case.sample, "forward", "--mode", "whole")
-    for column, values in (("progress", expected.progress), ("hop", expected.hop)):
-        np.testing.assert_array_equal(signals[f"reward.own.{column}"].to_numpy(), np.tile(values, 2))
-    assert signals["reward.own.is_inference_frame"].to_pylist() == [0, 1, 1] * 2
 
 
 def test_labels_mark_unclear_answers(asked: Served, tmp_path: Path) -> None:

@@ -4,10 +4,8 @@
 from __future__ import annotations
 
 import os
-import pickle
 import re
 from collections.abc import Iterator
-from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from http.server import BaseHTTPRequestHandler
@@ -23,34 +21,23 @@ import rfm_export
 from engines import serve_config
 from gateways import answers, poll
 from paths import ROOT
+from repositories import FAILING, FAILING_STEPS
 from rfm_client import (
     DeadlineExceededError,
     InferenceFailedError,
     InvalidSampleError,
     ProgressSample,
     RewardClient,
-    RewardError,
     ServerUnavailableError,
 )
-from servers import Endpoints, Serving, serving, wait_for, web_server
-from tensors import encode_samples
+from rfm_client.contract.wire import encode_samples
+from servers import Endpoints, Quiet, Serving, serving, wait_for, web_server
 from trajectories import random_trajectory
 
 CONFIG = goldens.config("c1_t1_disc10")
 NOBODY = "grpc://127.0.0.1:9"
 PATIENCE_S = 30.0
 RANDOM_ID = re.compile(r"[0-9a-f]{16}")
-FAILING_STEPS = 7
-
-# A model with a fault.
-FAULTY = f"""
-
-class TritonPythonModel(TritonPythonModel):
-    def answer(self, questions, execution):
-        if any(getattr(question.sample, "frame_steps", 0) == {FAILING_STEPS} for question in questions):
-            raise ZeroDivisionError("a fault of the model's")
-        return super().answer(questions, execution)
-"""
 
 
 @dataclass(frozen=True)
@@ -76,7 +63,7 @@ class Running:
         return found()
 
 
-class Collector(BaseHTTPRequestHandler):
+class Collector(Quiet, BaseHTTPRequestHandler):
     """Takes traces, as an OpenTelemetry collector does."""
 
     def __init__(self, traces: list[bytes], *connection: Any) -> None:
@@ -87,9 +74,6 @@ class Collector(BaseHTTPRequestHandler):
         self.traces.append(self.rfile.read(int(self.headers["Content-Length"])))
         self.send_response(200)
         self.end_headers()
-
-    def log_message(self, *_arguments: object) -> None:
-        pass
 
 
 def documented_options(traces_url: str) -> list[str]:
@@ -110,7 +94,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     repository = folder / "repository"
     rfm_export.export(CONFIG.checkpoint, repository, serve_config(CONFIG))
     model = repository / "rfm" / "1" / "model.py"
-    model.write_text(model.read_text() + FAULTY)
+    model.write_text(model.read_text() + FAILING)
     traces: list[bytes] = []
     with web_server(partial(Collector, traces)) as collector, pytest.MonkeyPatch.context() as environment:
         environment.setitem(os.environ, "RFM_LOG_LEVEL", "debug")
@@ -125,7 +109,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
 
 GOOD = ProgressSample(random_trajectory(0, 3))
 TOO_LONG = ProgressSample(random_trajectory(0, 17))
-FAILING = ProgressSample(random_trajectory(0, 3), frame_steps=FAILING_STEPS)
+BREAKING = ProgressSample(random_trajectory(0, 3), frame_steps=FAILING_STEPS)
 
 
 @pytest.mark.triton
@@ -144,7 +128,7 @@ def test_what_is_refused_is_told_with_its_request_and_logged_at_debug(running: R
 def test_what_failed_is_logged_as_an_error_with_its_traceback(running: Running) -> None:
     name = "a.fault/of-the-model"
     with running.client() as client, pytest.raises(InferenceFailedError) as raised:
-        client.evaluate([FAILING], request_id=name)
+        client.evaluate([BREAKING], request_id=name)
     assert str(raised.value) == f"scoring failed; the server's log has the reason (request {name}-1)"
     said = running.said_of(f"{name}-1")
     assert {level for level, _ in said} == {"ERROR"}
@@ -178,15 +162,6 @@ def test_a_request_without_an_answer_is_named_too(running: Running) -> None:
     with running.client() as client, pytest.raises(DeadlineExceededError) as raised:
         client.evaluate([ProgressSample(random_trajectory(0, 500), frame_steps=16)], timeout_s=0.05, request_id="late")
     assert raised.value.request_id in ("late-1", None)  # None: the time was up before it was sent
-
-
-def test_an_error_keeps_its_request_where_it_goes() -> None:
-    error = InvalidSampleError.at("num_frames", "1", "2")
-    error.request_id = "x-1"
-    for other in (copy(error), pickle.loads(pickle.dumps(error))):
-        assert (str(other), other.request_id) == ("num_frames: expected 1, got 2 (request x-1)", "x-1")
-    assert str(error.inside("samples[3]")) == "samples[3].num_frames: expected 1, got 2 (request x-1)"
-    assert str(RewardError("no request")) == "no request"
 
 
 @pytest.mark.triton

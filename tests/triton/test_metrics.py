@@ -18,8 +18,8 @@ from prometheus_client.parser import text_string_to_metric_families
 import goldens
 import rfm_export
 from engines import serve_config
-from mixtures import TOLD_S, mixed_samples
-from patients import make_repository
+from mixtures import TOLD_S, infer, mixed_samples
+from repositories import FAILING, FAILING_STEPS, make_repository
 from rfm.serve.installation import Installation, find_installation
 from rfm.triton_model.metrics import BUCKETS_S, PADDING_BUCKETS, SAMPLES_BUCKETS
 from rfm.triton_model.request import OUTCOMES, UNKNOWN_TYPE
@@ -32,9 +32,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract import wire
-from rfm_client.serving import ServerStatus
 from servers import RepositoryApi, Served, start_triton, wait_for
-from tensors import infer
 from trajectories import random_trajectory
 
 pytestmark = pytest.mark.triton
@@ -49,17 +47,6 @@ HISTOGRAMS = {
     "collate_seconds": BUCKETS_S,
     "forward_seconds": BUCKETS_S,
 }
-
-FAILING_STEPS = 7
-FAILING = f"""
-
-
-class TritonPythonModel(TritonPythonModel):
-    def answer(self, questions, execution):
-        if any(getattr(question.sample, "frame_steps", 0) == {FAILING_STEPS} for question in questions):
-            raise ZeroDivisionError("a fault of the model's")
-        return super().answer(questions, execution)
-"""
 
 
 @dataclass(frozen=True)
@@ -103,7 +90,7 @@ def served_too(served: Served) -> Iterator[Served]:
     rfm_export.export(PLAIN.checkpoint, served.repository, replace(serve_config(PLAIN, TWICE), instances=2))
     file = served.repository / TWICE / "1" / "model.py"
     file.write_text(file.read_text() + FAILING)
-    with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
+    with served.api() as api:
         api.load(TWICE)
         yield served
         api.unload(TWICE)
@@ -176,28 +163,6 @@ def test_raw_frames_are_counted_where_they_are_encoded_and_where_they_are_scored
     assert counted(after, before, FILMED) == {"progress scored": 1, "preference scored": 1, "frames": 4 + 7}
 
 
-def test_the_client_s_status_and_prometheus_agree(served: Served) -> None:
-    """Without the admin key: the repository's index is not asked for."""
-
-    def status(protocol: str) -> tuple[int, int]:
-        read = ServerStatus.read(served.url(protocol), metrics_url=served.endpoints.metrics_url)
-        (model,) = (model for model in read.models if model.name == MODEL)
-        assert (model.state, model.version, read.ready) == ("READY", "1", True)
-        return model.requests_succeeded, model.samples
-
-    before = {protocol: status(protocol) for protocol in ("grpc", "http")}
-    with client(served, MODEL) as asked:
-        for index in range(7):
-            asked.evaluate([ProgressSample(random_trajectory(index, 2 + index))] * 3)
-    families = text_string_to_metric_families(httpx.get(served.endpoints.metrics_url).text)
-    samples = [sample for family in families for sample in family.samples if sample.labels.get("model") == MODEL]
-    told = {sample.name: sample.value for sample in samples}
-    for protocol in before:
-        after = status(protocol)
-        assert [after[0] - before[protocol][0], after[1] - before[protocol][1]] == [7, 21]
-        assert after == (told["nv_inference_request_success_total"], told["nv_inference_count_total"])
-
-
 @pytest.mark.nightly
 def test_a_model_that_is_loaded_again_counts_on(served_too: Served) -> None:
     """An unloaded checkpoint is served no more; one loaded in place is."""
@@ -207,7 +172,7 @@ def test_a_model_that_is_loaded_again_counts_on(served_too: Served) -> None:
     def shows(value: float) -> Callable[[], bool]:
         return lambda: scrape(served_too, 0).value("checkpoint_info", model=TWICE) == value
 
-    with client(served_too, TWICE) as asked, RepositoryApi(served_too.url("grpc"), served_too.server.admin_key) as api:
+    with client(served_too, TWICE) as asked, served_too.api() as api:
         asked.evaluate([sample])
         api.unload(TWICE)
         api.wait_gone(TWICE)

@@ -18,9 +18,8 @@ import goldens
 import rfm_export
 from commands import own_regions
 from engines import load_engine, serve_config
-from mixtures import FRAMES_MODEL, MODEL, assert_same, counts, mixed_samples, plug, wait_until_at_work
-from patients import answering_after
-from repositories import bound_queue, configure, forget_input
+from mixtures import FRAMES_MODEL, MODEL, assert_same, counts, infer, mixed_samples, plug, wait_until_at_work
+from repositories import forget_input
 from rfm_client import (
     InvalidSampleError,
     PreferenceSample,
@@ -28,14 +27,14 @@ from rfm_client import (
     RewardClient,
     RewardError,
     Sample,
-    ServerUnavailableError,
     SimilaritySample,
     Trajectory,
 )
-from servers import RepositoryApi, Served
-from tensors import Tensors, encode_samples, infer
+from rfm_client.contract.wire import Tensors, encode_samples
+from servers import Served
 from tolerances import TOLERANCE
 from trajectories import random_trajectory
+from vlm import video
 
 pytestmark = pytest.mark.triton
 
@@ -57,22 +56,15 @@ def test_a_reference_answer_of_each_kind_of_checkpoint_comes_back(
     case.check_response(results)
 
 
-def video(seed: int, num_frames: int, height: int, width: int) -> Trajectory:
-    frames = np.random.default_rng(seed).integers(0, 256, (num_frames, height, width, 3), np.uint8)
-    return Trajectory(frames=frames, task=f"task {seed}")
-
-
 def filmed_samples(count: int) -> list[Sample]:
     """Return pairs of both types with equal and different sizes, and single videos, all with different lengths."""
     samples: list[Sample] = []
     for index in range(count):
-        size = (48, 100) if index % 2 else (90, 61)
-        first = video(2 * index, 1 + index % 5, *size)
-        second = video(2 * index + 1, 1 + index % 3, *(size[::-1] if index % 4 > 1 else size))
-        kind = index % 3
-        samples.append(
-            ProgressSample(first) if kind == 0 else (PreferenceSample, SimilaritySample)[kind - 1](first, second)
-        )
+        size, task = (48, 100) if index % 2 else (90, 61), f"task {index}"
+        first = video(2 * index, 1 + index % 5, *size, task)
+        second = video(2 * index + 1, 1 + index % 3, *(size[::-1] if index % 4 > 1 else size), task)
+        pair = PreferenceSample if index % 3 == 1 else SimilaritySample
+        samples.append(pair(first, second) if index % 3 else ProgressSample(first))
     return samples
 
 
@@ -127,20 +119,6 @@ def test_callers_share_batches_and_a_bad_sample_fails_alone(served: Served, prot
         assert_same(outcome, wanted)
 
 
-def test_a_bad_sample_of_a_call_is_located_and_costs_no_other(served: Served) -> None:
-    """Too long, or with a width that Triton itself refuses."""
-    samples = mixed_samples(9)
-    samples[4] = ProgressSample(random_trajectory(0, 17))
-    samples[6] = ProgressSample(random_trajectory(1, 3, 768, 7))
-    with served.client("http") as client:
-        outcomes = client.evaluate(samples, return_errors=True)
-        with pytest.raises(InvalidSampleError, match=r"^samples\[4\]\.num_frames: "):
-            client.evaluate(samples[:6])
-    assert [type(outcome) for outcome in (outcomes[4], outcomes[6])] == [InvalidSampleError] * 2
-    for index in {*range(9)} - {4, 6}:
-        assert_same(outcomes[index], load_engine(MODEL).evaluate([samples[index]])[0])
-
-
 def embedded() -> Tensors:
     pair = PreferenceSample(random_trajectory(1, 3), random_trajectory(2, 2))
     return {name: array.copy() for name, array in encode_samples([pair]).items()}
@@ -182,28 +160,16 @@ BAD_EMBEDDINGS: dict[str, tuple[Tensors, str]] = {
         {"video_embeddings": np.ones((1, 5, 7), np.float32)},
         "video_embeddings.*[Ee]xpected.*768.*got.*7",
     ),
-    "fewer frames told than sent": (lengths(3, 1), "^video_embeddings: expected zeros behind the 4 frames that num_fr"),
     "dense mode beyond max_len": (
         {"sample_type": np.array([[0]], np.uint8), **lengths(5, 0), **steps(17)},
         r"^frame_steps: expected at most 16 \(max_len of this checkpoint.*\), got 17$",
-    ),
-    "no frames": (
-        {"video_embeddings": np.ones((1, 0, 768), np.float32), **lengths(0, 0)},
-        r"^num_frames: expected at least one frame of each .*, got \[0, 0\]$",
     ),
 }
 
 BAD_FRAMES: dict[str, tuple[Tensors, str]] = {
     "bytes that are no text": ({"task": np.array([[b"\xff\xfe"]], np.object_)}, "^task: expected UTF-8 text, got"),
-    "more frames told than sent": (lengths(3, 3), "^num_frames: expected at most the 5"),
-    "fewer frames told than sent": (lengths(2, 2), "^frames: expected zeros behind the 4"),
-    "a negative length": (lengths(-1, 6), "^num_frames: expected .*at least 1"),
     "no pixels": ({"frames": FRAMES[:, :, :0]}, "^frames: expected at least one frame of at least one pixel"),
     "four channels": ({"frames": np.ones((1, 5, 8, 6, 4), np.uint8)}, "[Ee]xpected.*3.*got.*4"),
-    "a sliver": (
-        {"frames": np.ones((1, 5, 2, 200, 3), np.uint8)},
-        "^frames: expected frames at most 50 times as lo",
-    ),
     "more second frames told than sent": (second(num=1), "^num_frames: expected at most the 1 frames in second_frames"),
     "fewer second frames told than sent": (second(num=5), "^second_frames: expected zeros behind the 2"),
     "first frames behind those told": ({**second(), "frames": FRAMES}, "^frames: expected zeros behind the 3"),
@@ -276,12 +242,11 @@ def test_no_other_user_can_read_the_shared_memory_of_a_server() -> None:
 @pytest.mark.parametrize("model", [FRAMES_MODEL, pytest.param(VLM, marks=pytest.mark.slow)])
 def test_a_second_array_may_hold_frames_of_one_size(served: Served, model: str) -> None:
     """Tensors may use the optional input for any pair, and for a sample without a second trajectory."""
-    frames = [np.random.default_rng(seed).integers(0, 256, (2, 56, 56, 3), np.uint8) for seed in (1, 2)]
-    videos = [Trajectory(frames=each, task="lift") for each in frames]
-    tensors = encode_samples([PreferenceSample(videos[0], videos[1]), ProgressSample(videos[0])])
+    first, second = (video(seed, 2, 56, 56) for seed in (1, 2))
+    tensors = encode_samples([PreferenceSample(first, second), ProgressSample(first)])
     apart = {
-        "frames": np.stack([frames[0], frames[0]]),
-        "second_frames": np.stack([frames[1], np.zeros_like(frames[1])]),
+        "frames": np.stack([first.positions, first.positions]),
+        "second_frames": np.stack([second.positions, np.zeros_like(second.positions)]),
     }
     outputs = ["progress", "success", "preference"]
     served.has(model)
@@ -299,7 +264,7 @@ def test_a_model_from_before_pairs_of_two_frame_sizes_says_so(served: Served) ->
     forget_input(served.repository, "before_frames", "second_frames")
     wide, tall = video(0, 2, 56, 84), video(1, 2, 84, 56)
     pairs = [PreferenceSample(wide, wide), PreferenceSample(wide, tall), PreferenceSample(tall, tall)]
-    with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
+    with served.api() as api:
         api.load("before_frames")
         with served.client("grpc", "before") as client:
             one_size, two_sizes, another_size = client.evaluate(pairs, return_errors=True)
@@ -311,32 +276,3 @@ def test_a_model_from_before_pairs_of_two_frame_sizes_says_so(served: Served) ->
     )
     assert not isinstance(one_size, RewardError)
     assert not isinstance(another_size, RewardError)
-
-
-@pytest.mark.slow
-def test_a_full_queue_refuses_at_once_and_patience_is_served(served: Served) -> None:
-    """By Triton's policy. With a single instance, Triton 2.51 notices it free half a second late."""
-    config, name = goldens.config(MODEL), "queued"
-    rfm_export.export(config.checkpoint, served.repository, serve_config(config, name))
-    file = served.repository / name / "1" / "model.py"
-    file.write_text(file.read_text() + answering_after(0.5))
-    configure(served.repository / name, instances=2, batch_size=2)
-    bound_queue(served.repository / name, max_queue_size=4, timeout_ms=600)
-    with RepositoryApi(served.url("grpc"), served.server.admin_key) as api, ThreadPoolExecutor(24) as pool:
-
-        def ask(client: RewardClient) -> Exception | None:
-            try:
-                client.progress(random_trajectory(0, 3))
-            except ServerUnavailableError as error:
-                return error
-            return None
-
-        api.load(name)
-        for protocol in ("grpc", "http"):
-            with RewardClient(served.url(protocol), model=name, retry=False) as client:
-                outcomes = list(pool.map(ask, [client] * 24))
-            assert [error for error in outcomes if error is not None and "Exceeds maximum queue size" in str(error)]
-            assert outcomes.count(None) >= 2
-        with served.client("grpc", name) as patient:  # who asks again is served in the end
-            assert list(pool.map(ask, [patient] * 12)) == [None] * 12
-        api.unload(name)

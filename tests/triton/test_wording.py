@@ -28,7 +28,7 @@ from rfm_client import (
     ServerUnavailableError,
 )
 from rfm_client.contract import triton, wire
-from servers import RepositoryApi, Served
+from servers import Served
 from trajectories import random_trajectory
 
 pytestmark = pytest.mark.triton
@@ -116,12 +116,6 @@ def test_triton_says_so_in_these_words(asker: Asker, name: str) -> None:
         raise error
 
 
-def test_a_restricted_api_wants_its_key(asker: Asker) -> None:
-    status, message = failure(asker.client.get_model_repository_index)
-    assert triton.RESTRICTED in message
-    assert triton.is_denied(status, message)
-
-
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_a_dead_process_and_an_unloaded_model_are_told_apart(served: Served) -> None:
@@ -139,7 +133,7 @@ def test_a_dead_process_and_an_unloaded_model_are_told_apart(served: Served) -> 
             assert phrase in message
             assert type(triton.error_of(status, message, triton.invalid_sample)) is kind
 
-    with ExitStack() as clients, RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
+    with ExitStack() as clients, served.api() as api:
         for asker in askers:
             clients.enter_context(asker.client)
         api.load(model)
