@@ -7,14 +7,13 @@ import io
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import rerun
 from PIL import Image
 
 from client_commands import MODEL, TASK, WIDTHS, invoke
 from engine_server import EngineServer
+from recordings import entities, logged
 from rfm_client import FrameScores, load_trajectory
 from rfm_client.command_line import ExitCode
 from rfm_client.frames import frame_times_s
@@ -22,19 +21,6 @@ from rfm_client.recording import Recording
 
 JPEG_ERROR = 30  # largest difference after compression
 NS_PER_S = 1e9
-
-
-def entities(file: Path) -> set[str]:
-    return {column.entity_path for column in rerun.dataframe.load_recording(file).schema().component_columns()}
-
-
-def logged(file: Path, timeline: str, entity: str, component: str) -> tuple[list[Any], list[Any]]:
-    """Return a component's times and values in order."""
-    view = rerun.dataframe.load_recording(file).view(index=timeline, contents=entity)
-    table = view.select(timeline, f"{entity}:{component}").read_all()
-    times, values = table.column(0).cast("int64").to_pylist(), table.column(1).to_pylist()
-    rows = [(time, value[0]) for time, value in zip(times, values, strict=True) if value is not None]
-    return [time for time, _ in rows], [value for _, value in rows]
 
 
 def test_score_records_frames_and_curves_on_one_timeline(engines: EngineServer, video: Path, tmp_path: Path) -> None:

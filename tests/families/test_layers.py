@@ -141,9 +141,9 @@ def test_the_first_calls_of_all_functions_of_mkl_are_made_by_one_thread() -> Non
     assert "cos" in named
 
 
-def test_an_engine_multiplies_float32_as_float32(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
-    monkeypatch.setattr(torch.backends.cuda.matmul, "allow_tf32", True)
+def test_an_engine_multiplies_float32_as_float32() -> None:
+    torch.backends.cudnn.allow_tf32 = True
+    torch.backends.cuda.matmul.allow_tf32 = True
     Engine.of(published.load(goldens.REWIND[0].checkpoint))
     assert not torch.backends.cudnn.allow_tf32
     assert not torch.backends.cuda.matmul.allow_tf32

@@ -10,6 +10,7 @@ import importlib.util
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
@@ -62,5 +63,6 @@ def provide() -> None:
 
 def module(name: str, names: Mapping[str, Any]) -> ModuleType:
     made = ModuleType(name, "A fake of LeRobot, for tests.")
+    made.__spec__ = ModuleSpec(name, None)  # TorchRL looks for it
     made.__dict__.update(names)
     return made

@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.utils._device import _device_constructors
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
@@ -223,6 +224,7 @@ def pretended(monkeypatch: pytest.MonkeyPatch) -> Iterator[Seen]:
         return copy
 
     on_host = torch.tensor
+    _device_constructors()  # PyTorch keeps these functions at the first call: the real torch.tensor among them
 
     def tensor(data: Any, *, device: Any = None, **more: Any) -> torch.Tensor:
         made = on_host(data, **more)

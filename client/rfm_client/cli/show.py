@@ -89,7 +89,7 @@ class Table:
         return [self._line(each) for each in (*lines, ["-" * width for width in self._widths])]
 
     def row(self, cells: Sequence[str]) -> str:
-        """Return a row."""
+        """Return a table row of headers or cells."""
         names = (shortened(name, width) for name, width in zip(cells, self._widths[: self._names], strict=False))
         return self._line([*names, *cells[self._names :]])
 
