@@ -17,7 +17,6 @@ from rfm.qwen.backbone import VisionPlan
 from rfm.qwen.images import QwenImages
 from rfm.qwen.leaves import Leaf, Packs
 from rfm.qwen.video import Indices, Shot, SizedFrames, VlmVideo, shots_of
-from rfm_client.contract.samples import UInt8Array
 
 Spans: TypeAlias = list[tuple[int, int]]
 
@@ -55,11 +54,6 @@ class VlmRow:
     def cost(self) -> int:
         """Number of tokens that the language model computes: the conversation's, and those that its leaves add."""
         return self.num_tokens + sum(leaf.num_tokens for leaf in self.leaves)
-
-    @property
-    def frames(self) -> tuple[Sequence[UInt8Array] | UInt8Array, ...]:
-        """The frames of each trajectory before resizing, uint8 [H, W, 3] each."""
-        return tuple(video.frames for video in self.videos)
 
     @property
     def shown(self) -> Iterator[tuple[VlmVideo, Indices]]:
