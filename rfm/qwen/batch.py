@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from rfm.engine.device import pinned
-from rfm.engine.layers import concatenated
+from rfm.engine.layers import changed, concatenated
 from rfm.qwen.backbone import VisionPlan
 from rfm.qwen.images import QwenImages
 from rfm.qwen.leaves import Leaf, Packs
@@ -184,7 +184,7 @@ class QwenPixels:
     def changed(self, change: Callable[[Tensor], Tensor]) -> QwenPixels:
         """Return these pixels with ``change`` applied to the indices of the shots."""
         shots = [None if size.shots is None else change(size.shots) for size in self.sizes]
-        sizes = [replace(size, shots=changed) for size, changed in zip(self.sizes, shots, strict=True)]
+        sizes = [replace(size, shots=made) for size, made in zip(self.sizes, shots, strict=True)]
         return replace(self, sizes=sizes)
 
     def inputs(self, device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
@@ -264,6 +264,6 @@ class VlmBatch:
             query_rows=change(self.query_rows),
             query_tokens=change(self.query_tokens),
             pixels=None if self.pixels is None else self.pixels.changed(change),
-            plan=None if self.plan is None else self.plan.changed(change),
-            packs=tuple(packs.changed(change) for packs in self.packs),
+            plan=None if self.plan is None else changed(self.plan, change),
+            packs=tuple(changed(packs, change) for packs in self.packs),
         )
