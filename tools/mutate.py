@@ -31,7 +31,7 @@ VISION_LANGUAGE = (
 # Mutated files, and their tests: at least one test must fail.
 PARTS = {
     "client/rfm_client/contract/wire/*.py": "contract/test_*.py families/test_properties.py",
-    "rfm/engine/layers.py": "families/test_layers.py families/test_rewind.py",
+    "rfm/engine/layers.py": "families/test_layers.py families/test_rewind.py families/test_encoders.py",
     "rfm/families/rewind/*.py": "families/test_rewind.py families/test_*encoders.py families/test_checkpoint.py"
     " families/test_missing_heads.py families/test_adapters.py families/test_refused_checkpoints.py"
     " families/test_wrong_inputs.py export/test_provenance.py",

@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from rfm.files import MAX_UINT8
 
+Plan = TypeVar("Plan", bound=Any)
 WORTH_ONEDNN = 1 << 21  # multiplications; for fewer, the start of oneDNN costs more than it saves
 
 
@@ -122,6 +123,12 @@ def progress_from_logits(logits: Tensor) -> Tensor:
         return logits.squeeze(-1).sigmoid().float()
     bins = torch.linspace(0.0, 1.0, logits.shape[-1], device=logits.device)
     return logits.float().softmax(dim=-1) @ bins
+
+
+def changed(plan: Plan, change: Callable[[Tensor], Tensor]) -> Plan:
+    """Return a dataclass with ``change`` applied to its tensors."""
+    tensors: dict[str, Any] = {name: change(each) for name, each in vars(plan).items() if isinstance(each, Tensor)}
+    return replace(plan, **tensors)
 
 
 def concatenated(parts: Sequence[Tensor]) -> Tensor:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -95,13 +95,6 @@ class VisionPlan:
     windows: Runs | None = None
     order: Tensor | None = None
     back: Tensor | None = None
-
-    def changed(self, change: Callable[[Tensor], Tensor]) -> VisionPlan:
-        """Return the plan with ``change`` applied to its tensors."""
-        changed: dict[str, Any] = {
-            name: change(value) for name, value in vars(self).items() if isinstance(value, Tensor)
-        }
-        return replace(self, **changed)
 
 
 def plan(grids: Sequence[Grid], config: dict[str, Any]) -> VisionPlan:

@@ -12,12 +12,11 @@ import torch
 from torch import Tensor
 
 from rfm.engine.device import pinned
-from rfm.engine.layers import concatenated
+from rfm.engine.layers import changed, concatenated
 from rfm.qwen.backbone import VisionPlan
 from rfm.qwen.images import QwenImages
 from rfm.qwen.leaves import Leaf, Packs
 from rfm.qwen.video import Indices, Shot, SizedFrames, VlmVideo, shots_of
-from rfm_client.contract.samples import UInt8Array
 
 Spans: TypeAlias = list[tuple[int, int]]
 
@@ -55,11 +54,6 @@ class VlmRow:
     def cost(self) -> int:
         """Number of tokens that the language model computes: the conversation's, and those that its leaves add."""
         return self.num_tokens + sum(leaf.num_tokens for leaf in self.leaves)
-
-    @property
-    def frames(self) -> tuple[Sequence[UInt8Array] | UInt8Array, ...]:
-        """The frames of each trajectory before resizing, uint8 [H, W, 3] each."""
-        return tuple(video.frames for video in self.videos)
 
     @property
     def shown(self) -> Iterator[tuple[VlmVideo, Indices]]:
@@ -190,7 +184,7 @@ class QwenPixels:
     def changed(self, change: Callable[[Tensor], Tensor]) -> QwenPixels:
         """Return these pixels with ``change`` applied to the indices of the shots."""
         shots = [None if size.shots is None else change(size.shots) for size in self.sizes]
-        sizes = [replace(size, shots=changed) for size, changed in zip(self.sizes, shots, strict=True)]
+        sizes = [replace(size, shots=made) for size, made in zip(self.sizes, shots, strict=True)]
         return replace(self, sizes=sizes)
 
     def inputs(self, device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
@@ -270,6 +264,6 @@ class VlmBatch:
             query_rows=change(self.query_rows),
             query_tokens=change(self.query_tokens),
             pixels=None if self.pixels is None else self.pixels.changed(change),
-            plan=None if self.plan is None else self.plan.changed(change),
-            packs=tuple(packs.changed(change) for packs in self.packs),
+            plan=None if self.plan is None else changed(self.plan, change),
+            packs=tuple(changed(packs, change) for packs in self.packs),
         )

@@ -17,7 +17,7 @@ from rfm.engine.feature_cache import FeatureCache
 from rfm.files import NETWORK_CONFIG, CheckpointError, expecting, shown
 from rfm.qwen.collator import QwenCollator
 from rfm.qwen.lora import merged
-from rfm.qwen.network import BackboneConfig, build_backbone
+from rfm.qwen.network import build_backbone
 from rfm.qwen.predictor import QwenPredictor
 from rfm.qwen.processor import save_processor
 from rfm.qwen.rounded import fit
@@ -28,25 +28,6 @@ from rfm_client.contract import Sample
 
 _VISION = "visual."  # beginning of parameters that patches pass
 _EMBEDDING = "embed_tokens."  # looked up, not multiplied
-
-
-def flop(config: BackboneConfig, collator: QwenCollator, sample: Sample) -> float:
-    """Return the operations of a sample's products with weights: two for each parameter and each patch or token.
-
-    The products of attention, about a tenth, and the heads are left out.
-    Raises InvalidSampleError.
-    """
-    rows = collator.rows(sample)
-    videos = dict.fromkeys(video for row in rows for video in row.videos)
-    with torch.device("meta"):
-        backbone = build_backbone(config, config.torch_dtype)
-    counts = {name: weights.numel() for name, weights in backbone.named_parameters() if _EMBEDDING not in name}
-    of_vision = sum(count for name, count in counts.items() if name.startswith(_VISION))
-    num_patches = sum(collator.num_patches(video) for video in videos)
-    if collator.makes_trees:
-        rows = trees(rows, collator.visual_pad, are_images=collator.config.multi_image)
-    num_tokens = sum(row.cost for row in rows)
-    return 2.0 * (of_vision * num_patches + (sum(counts.values()) - of_vision) * num_tokens)
 
 
 LORA = "lora"  # key in ``parts``: the factors that change the network's weights
@@ -103,8 +84,23 @@ class QwenCheckpoint:
         return {name: value for name, value in config_fields(self.config).items() if name != "backbone"}
 
     def flop(self, sample: Sample) -> float:
-        """Return the operations of a sample's products. Raises CheckpointError, InvalidSampleError."""
-        return flop(self.config, self.collator, sample)
+        """Return the operations of a sample's products with weights: two for each parameter and each patch or token.
+
+        The products of attention, about a tenth, and the heads are left out.
+        Raises CheckpointError, InvalidSampleError.
+        """
+        collator, config = self.collator, self.config
+        rows = collator.rows(sample)
+        videos = dict.fromkeys(video for row in rows for video in row.videos)
+        with torch.device("meta"):
+            backbone = build_backbone(config, config.torch_dtype)
+        counts = {name: weights.numel() for name, weights in backbone.named_parameters() if _EMBEDDING not in name}
+        of_vision = sum(count for name, count in counts.items() if name.startswith(_VISION))
+        num_patches = sum(collator.num_patches(video) for video in videos)
+        if collator.makes_trees:
+            rows = trees(rows, collator.visual_pad, are_images=config.multi_image)
+        num_tokens = sum(row.cost for row in rows)
+        return 2.0 * (of_vision * num_patches + (sum(counts.values()) - of_vision) * num_tokens)
 
     def predictor(
         self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None

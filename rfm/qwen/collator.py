@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from rfm.engine.feature_cache import FeatureCache
+from rfm.engine.layers import concatenated
 from rfm.engine.threads import IN_TURN, FrameThreads
 from rfm.qwen.backbone import Box, plan, positions
 from rfm.qwen.batch import QwenPixels, Shots, VlmBatch, VlmRow
@@ -106,17 +107,6 @@ class QwenCollator:
         """Return the conversations of a sample. Raises InvalidSampleError if the checkpoint cannot score it."""
         raise NotImplementedError
 
-    def _uncached_to_size(self, video: VlmVideo, threads: FrameThreads) -> SizedFrames:
-        keys = {shot: (id(video), shot) for shot in video.shots(are_images=self.config.multi_image)}
-        needed = sorted({frame for shot in keys for frame in shot})
-        places = np.full(len(video.frames), -1)
-        places[needed] = np.arange(len(needed))
-        return SizedFrames(self._all_to_size(video, needed, threads), places, keys)
-
-    def _all_to_size(self, video: VlmVideo, needed: Sequence[int], threads: FrameThreads) -> Tensor:
-        parts = threads.parts(partial(self._to_size, video), needed)
-        return parts[0] if len(parts) == 1 else torch.cat(parts)
-
     def collate(self, rows: Sequence[VlmRow], length: int | None = None) -> VlmBatch:
         """Return the batch of conversations of any kinds and lengths, whose frames have been resized.
 
@@ -164,17 +154,21 @@ class QwenCollator:
         cache: frames of shots in it need no resizing; None: no cache
         threads: prepare the frames
         """
+        keys: dict[Shot, Hashable]
         if cache is None:
-            return self._uncached_to_size(video, threads)
-        video.compute_digests(threads)
-        keys = self.shot_keys(video)
-        found = cache.found(keys.values())
-        kept = {key: found[key] for shot, key in keys.items() if key in found and not video.is_blank(shot)}
-        alike = video.alike
+            keys = {shot: (id(video), shot) for shot in video.shots(are_images=self.config.multi_image)}
+            kept, alike = {}, np.arange(len(video.frames))
+        else:
+            video.compute_digests(threads)
+            keys = self.shot_keys(video)
+            found = cache.found(keys.values())
+            kept = {key: found[key] for shot, key in keys.items() if key in found and not video.is_blank(shot)}
+            alike = video.alike
         needed = sorted({int(alike[frame]) for shot, key in keys.items() if key not in kept for frame in shot})
         places = np.full(len(video.frames), -1)
         places[needed] = np.arange(len(needed))
-        return SizedFrames(self._all_to_size(video, needed, threads), places[alike], keys, kept)
+        pixels = concatenated(threads.parts(partial(self._to_size, video), needed))
+        return SizedFrames(pixels, places[alike], keys, kept)
 
     def shot_keys(self, video: VlmVideo) -> dict[Shot, Hashable]:
         """Return each shot's key: its size and its frames' digests, on which alone the shot's features depend."""

@@ -75,6 +75,28 @@ def fitted_size(height: int, width: int, factor: int, tokens: tuple[float, float
     return fitted[0], fitted[1]
 
 
+def bounded_size(
+    height: int, width: int, factor: int, bounds_px: tuple[int, int], num_frames: int = 1, num_filled: int = 1
+) -> tuple[int, int]:
+    """Return height and width as transformers' processors resize frames: in multiples of ``factor``, within bounds.
+
+    factor: pixels a side of a merged token
+    bounds_px: least and most pixels of all frames
+    num_filled: number of frames with those that fill up the last temporal patch
+    Raises InvalidSampleError for an image over 200 times as long as wide.
+    """
+    check_aspect(height, width)
+    least, most = bounds_px
+    rows, columns = (round(side / factor) * factor for side in (height, width))
+    if num_filled * rows * columns > most:
+        scale = math.sqrt(num_frames * height * width / most)
+        rows, columns = (max(factor, math.floor(side / scale / factor) * factor) for side in (height, width))
+    elif num_filled * rows * columns < least:
+        scale = math.sqrt(least / (num_frames * height * width))
+        rows, columns = (math.ceil(side * scale / factor) * factor for side in (height, width))
+    return rows, columns
+
+
 def resized(frame: UInt8Array, height: int, width: int, resample: int = PIL_BICUBIC) -> UInt8Array:
     """Resize a frame with Pillow: uint8 [H, W, 3] -> [height, width, 3]; ``resample``: Pillow's filter."""
     if frame.shape[:2] == (height, width):
@@ -181,16 +203,7 @@ class BoundedImages(QwenImages):
         return scaled_in_integers(pixels, self._image_size(frames.shape[1], frames.shape[2]))
 
     def _image_size(self, height: int, width: int) -> tuple[int, int]:
-        check_aspect(height, width)
-        factor = self.patch_px * MERGE
-        rows, columns = (round(side / factor) * factor for side in (height, width))
-        if rows * columns > self.most_px:
-            scale = math.sqrt(height * width / self.most_px)
-            rows, columns = (max(factor, math.floor(side / scale / factor) * factor) for side in (height, width))
-        elif rows * columns < self.least_px:
-            scale = math.sqrt(self.least_px / (height * width))
-            rows, columns = (math.ceil(side * scale / factor) * factor for side in (height, width))
-        return rows, columns
+        return bounded_size(height, width, self.patch_px * MERGE, (self.least_px, self.most_px))
 
 
 def scaled_video(video: Tensor, size: tuple[int, int]) -> Tensor:

@@ -32,7 +32,6 @@ from rfm.qwen.processor import (
     normalisation_of,
     patch_px,
     read_processor,
-    without_limits,
 )
 from rfm.qwen.video import Indices, VlmVideo
 from rfm.saved import REWARD_MODEL, Saved
@@ -203,7 +202,8 @@ class LanguageCheckpoint(QwenCheckpoint):
             raise CheckpointError.at(f"base model {self.processor}", expected, len(tokenizer))
         check_tokens(self.config, tokenizer, self.processor, self.own_tokens)
         where = f"base model {self.processor}: preprocessing of {'videos' if self.reads_videos else 'images'}"
-        preprocessor = preprocessor if self.reads_videos else without_limits(preprocessor)
+        if not self.reads_videos:  # ``pixel_limits`` reads these of images
+            preprocessor = {**preprocessor, "min_pixels": None, "max_pixels": None}
         normalisation = normalisation_of(preprocessor, SIZED_BY_PROCESSOR, where)
         patch = patch_px(preprocessor, self.config.backbone["vision_config"], where)
         collator = self.make_collator(tokenizer, patch, normalisation)

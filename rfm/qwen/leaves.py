@@ -10,8 +10,7 @@ L tokens of a trunk, R packs in a call, P tokens of the longest, N levels of the
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -80,13 +79,6 @@ class Packs:
     places: Tensor
     seen: Tensor
     upto: Tensor
-
-    def changed(self, change: Callable[[Tensor], Tensor]) -> Packs:
-        """Return the packs with ``change`` applied to their tensors."""
-        changed: dict[str, Any] = {
-            name: change(value) for name, value in vars(self).items() if isinstance(value, Tensor)
-        }
-        return replace(self, **changed)
 
     @property
     def inputs(self) -> dict[str, Tensor]:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from rfm.config import VideoPrompt, Weights
 from rfm.engine.graphs import Graphs
-from rfm.engine.layers import concatenated
+from rfm.engine.layers import changed, concatenated
 from rfm.qwen.backbone import (
     UNIT,
     KeyValues,
@@ -129,7 +129,7 @@ def graphed_features(graphs: Graphs, visual: Any, patches: Tensor, plan: VisionP
 
     def vision(patches: Tensor, *parts: Tensor) -> Tensor:
         left = iter(parts)
-        return features(visual, patches, plan.changed(lambda _: next(left)))
+        return features(visual, patches, changed(plan, lambda _: next(left)))
 
     return graphs(vision, [patches, *of_plan], ("vision", plan.shots, plan.windows), len(patches) // UNIT)
 

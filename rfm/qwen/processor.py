@@ -147,11 +147,6 @@ def pixel_limits(settings: Settings, where: object) -> dict[str, int]:
     return found
 
 
-def without_limits(settings: Settings) -> dict[str, Any]:
-    """Return the settings without those that ``pixel_limits`` reads."""
-    return {name: value for name, value in settings.items() if name not in ("min_pixels", "max_pixels")}
-
-
 def patch_px(settings: Settings, vision: Settings, where: object) -> int:
     """Return the side of a patch, which preprocessor and vision tower must state alike. Raises CheckpointError."""
     expected, stated = vision["patch_size"], settings.get("patch_size")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from argparse import Namespace
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 import goldens
+import spoilt
 from rfm import published
 from rfm.published import CheckpointError
 from spoilt import Spoil, both, convert, copied, in_two_shards, settings, sharded_pickle, taken, weights
@@ -24,6 +26,7 @@ CONTINUOUS = "legacy_keys_l2"  # lacks causal_mask and use_per_frame_progress_to
 MISMATCHED = "h40_L3_H5_c1_t1_disc5_cfgmismatch"  # the configs say l2 and 32 bins, the weights 5 bins
 IN_RUN_FOLDER = "c1_t1_disc10"  # config.yaml in the parent folder
 WITH_IMAGES = "q3_tok_disc10"  # vision-language: every frame an image, with a progress token
+QWEN_2_5 = "q25_mean_l2"
 ADAPTER = "q25_peft_adapter_disc10"
 
 
@@ -68,6 +71,11 @@ def saved_by_us(folder: Path) -> None:
     published.load(goldens.config(IN_RUN_FOLDER).checkpoint).save(folder)
 
 
+def right_under(found: re.Match[str]) -> str:
+    return "visual" if found[1] == "visual" else "model"
+
+
+ROTARY = ("language_model.rotary_emb", "visual.rotary_pos_emb")
 OTHER_FORMS: dict[str, tuple[str, Spoil]] = {
     "saved by us": (IN_RUN_FOLDER, saved_by_us),
     "shards": (CONTINUOUS, in_two_shards),
@@ -83,6 +91,8 @@ OTHER_FORMS: dict[str, tuple[str, Spoil]] = {
     "FSDP of a vision-language one": (WITH_IMAGES, renamed(in_fsdp)),
     "DataParallel and torch.compile": (CONTINUOUS, renamed(lambda name: f"module._orig_mod.{name}")),
     "some layers": (CONTINUOUS, renamed(lambda name: name.replace("transformer.", "transformer._orig_mod."))),
+    "layers right under the model": (QWEN_2_5, spoilt.renamed(r"^model\.(language_model|visual)\b", right_under)),
+    "rotary frequencies": (QWEN_2_5, weights(lambda w: w.update({f"model.{name}.inv_freq": torch.ones(8) for name in ROTARY}))),
     "Lightning": (CONTINUOUS, renamed(lambda name: f"model.{name}")),
 }  # fmt: skip
 

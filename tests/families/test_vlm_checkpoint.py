@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 import goldens
 import spoilt
@@ -18,7 +17,7 @@ from engines import load_engine
 from rfm import published
 from rfm.engine import Engine
 from rfm_client import ProgressSample, Result, RewardError
-from spoilt import Spoil, in_json, in_yaml, nested, renamed, run_settings, settings, weights, with_sources
+from spoilt import Spoil, in_json, in_yaml, nested, run_settings, settings, with_sources
 from vlm import PLAIN, assert_close, load, video
 
 SAMPLE = ProgressSample(video(0, 3, 60, 84))
@@ -64,21 +63,6 @@ FORMS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "Qwen2.5-VL of transformers 5": ("q25_mean_l2", in_json("config.json", as_transformers_5_writes)),
     "Qwen3-VL of transformers 5": (PLAIN, in_json("config.json", as_transformers_5_writes)),
     "Qwen2.5-VL without text_config": ("q25_mean_l2", in_json("config.json", as_before_text_config)),
-    "layers right under the model": (
-        "q25_mean_l2",
-        renamed(r"^model\.(language_model|visual)\b", lambda found: "visual" if found[1] == "visual" else "model"),
-    ),
-    "with rotary frequencies": (
-        "q25_mean_l2",
-        weights(
-            lambda w: w.update(
-                {
-                    "model.language_model.rotary_emb.inv_freq": torch.ones(8),
-                    "model.visual.rotary_pos_emb.inv_freq": torch.ones(4),
-                }
-            ),
-        ),
-    ),
 }
 
 

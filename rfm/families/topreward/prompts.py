@@ -22,7 +22,7 @@ from rfm.qwen.images import (
     MERGE,
     Grid,
     QwenImages,
-    check_aspect,
+    bounded_size,
     resized,
     scaled_in_integers,
     scaled_video,
@@ -103,16 +103,9 @@ class TopRewardImages(QwenImages):
             return SIDES_PX[1], SIDES_PX[1]
         expected = f"frames of at least {factor} x {factor} pixels"
         require("frames", min(height, width) >= factor, expected, f"{height} x {width}", InvalidSampleError)
-        check_aspect(height, width)
-        fitted = [round(side / factor) * factor for side in (height, width)]
-        pixels = math.ceil(num_frames / FRAMES_PER_GROUP) * FRAMES_PER_GROUP * fitted[0] * fitted[1]
-        if pixels > self.config.most_px:
-            scale = math.sqrt(num_frames * height * width / self.config.most_px)
-            fitted = [max(factor, math.floor(side / scale / factor) * factor) for side in (height, width)]
-        elif pixels < self.config.least_px:
-            scale = math.sqrt(self.config.least_px / (num_frames * height * width))
-            fitted = [math.ceil(side * scale / factor) * factor for side in (height, width)]
-        return fitted[0], fitted[1]
+        num_filled = math.ceil(num_frames / FRAMES_PER_GROUP) * FRAMES_PER_GROUP
+        bounds_px = self.config.least_px, self.config.most_px
+        return bounded_size(height, width, factor, bounds_px, num_frames, num_filled)
 
     def grid(self, groups: int, height: int, width: int) -> Grid:
         """Return the grid of ``groups`` temporal patches of frames of this size in pixels."""
