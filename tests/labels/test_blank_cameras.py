@@ -48,7 +48,7 @@ def test_many_episodes_are_abbreviated(tmp_path: Path) -> None:
     assert "in 20 of 40 episodes (0,2,4,6,8,10,12,14,16,18,20,22,...): " in told
 
 
-def test_each_run_and_a_report_tell_in_which_episodes_a_camera_shows_nothing(tmp_path: Path) -> None:
+def test_each_run_and_a_report_list_the_episodes_in_which_a_camera_shows_nothing(tmp_path: Path) -> None:
     file, output = of_hdf5(tmp_path), tmp_path / "labels"
     line = f"video: black pictures, in 2 of 3 episodes (0,2): {ADVICE}"
     assert lines_of(file, output) == [line]
@@ -61,7 +61,7 @@ NO_COLOURS = ("agentview_depth", "depth_head", "seg_instance_id", "topDepth", "d
 COLOURS = ("deep_camera", "segway", "masked_rgb", "overflow", "abnormal")
 
 
-def test_words_in_names_tell_cameras_without_colours(tmp_path: Path) -> None:
+def test_words_in_names_mark_cameras_without_colours(tmp_path: Path) -> None:
     assert [camera for camera in (*NO_COLOURS, *COLOURS) if word_of_no_colours(camera)] == list(NO_COLOURS)
     file, notes = write_robomimic(tmp_path / "demos.hdf5", [{"front": noise(), "depth_head": noise()}], None), Notes()
     dataset = open_dataset(file, task=TASK)

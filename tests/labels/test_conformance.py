@@ -17,7 +17,7 @@ from PIL import Image
 
 import hdf5_writers
 from hdf5_writers import TASK, decoded, jpeg, video
-from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, brightness
+from labelling import LEROBOT, WRIST, BrightnessScorer, brightness, without_cost
 from paths import ROOT
 from pictures import numbered, numbers, write_video
 from rfm_client import RewardError, UInt8Array
@@ -233,12 +233,12 @@ def test_each_frame_gets_its_label_and_a_second_run_scores_what_is_missing(
         assert labels.frames.tolist() == list(range(len(expected[0])))
     num_scored = sum(dataset.episode(number).num_frames for number in chosen) * len(cameras)
     assert scorer.num_samples == num_scored
-    files = [file.read_bytes() for file in report.files]
+    files = [without_cost(file) for file in report.files]
     (output / ".rfm_parts" / f"{report.plan.items[0].key}.parquet").unlink()
     again = BrightnessScorer()
     report = label(dataset, again, options)
     assert again.num_samples == dataset.episode(chosen[0]).num_frames * len(cameras)
-    assert len(report.files) == len(files)
+    assert [without_cost(file) for file in report.files] == files
 
 
 @every_format
@@ -282,7 +282,3 @@ def test_a_broken_episode_is_named_before_a_score_and_lets_the_others_through(
     report = label(dataset, scorer, LabelOptions(**options, episodes=rest))
     assert report.summary is not None
     assert report.summary.episodes.tolist() == rest
-
-
-def test_lerobot_s_cameras_are_those_of_the_toy_world() -> None:
-    assert open_dataset(LEROBOT / "toy_v21").chosen_cameras() == (FRONT, WRIST)

@@ -38,7 +38,7 @@ def labels(file: Path, progress: Curves, success: Curves | None = None) -> Path:
     return file
 
 
-def test_successes_are_told_from_failures(tmp_path: Path) -> None:
+def test_thresholds_separate_successes_from_failures(tmp_path: Path) -> None:
     final = {0: 0.9, 1: 0.8, 2: 0.8, 3: 0.1}  # the last of each episode; a success ties with a failure
     success = {0: [0.9, 0.0, 0.7, 0.7], 1: [0.4, 0.4], 2: [0.9, 0.9, 0.3, 0.3, 0.9], 3: [0.1] * 4}  # the last 3 vote
     curves = {each: [*[0.0] * (len(success[each]) - 1), value] for each, value in final.items()}
@@ -210,7 +210,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 
 @pytest.mark.parametrize("ask, message", REFUSED.values(), ids=REFUSED)
-def test_what_cannot_be_compared_is_refused(tmp_path: Path, ask: Callable[[Path], Any], message: str) -> None:
+def test_incomparable_files_and_outcomes_are_refused(tmp_path: Path, ask: Callable[[Path], Any], message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         ask(tmp_path)
 

@@ -186,7 +186,7 @@ UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, the opened path, the
     "videos of an episode each": (
         ["a/b/episode_000000.mp4"],
         "",
-        "list those of one camera (a/b/episode_000000.mp4) in tasks.csv",
+        "list the videos of one camera (a/b/episode_000000.mp4) in tasks.csv",
     ),
     "pictures and a video": (
         ["0/1.png", "a.mp4"],
@@ -234,7 +234,9 @@ CLONED: dict[str, tuple[Path | None, str]] = {  # a copied dataset, and its file
 
 
 @pytest.mark.parametrize(("source", "name"), CLONED.values(), ids=CLONED)
-def test_files_that_git_cloned_without_git_lfs_are_told(tmp_path: Path, source: Path | None, name: str) -> None:
+def test_files_cloned_without_git_lfs_are_refused_with_the_command_that_fetches_them(
+    tmp_path: Path, source: Path | None, name: str
+) -> None:
     root = tmp_path / "data"
     if source is not None:
         shutil.copytree(source, root)
@@ -245,13 +247,13 @@ def test_files_that_git_cloned_without_git_lfs_are_told(tmp_path: Path, source: 
 
 
 @pytest.mark.parametrize("name", ["/nothing/here", "no dataset"])
-def test_what_is_not_there_is_refused(name: str) -> None:
+def test_a_missing_dataset_is_refused(name: str) -> None:
     with pytest.raises(DatasetError, match=f"^{name}: expected a LeRobot dataset .* got none$"):
         open_dataset(name)
 
 
 @pytest.mark.parametrize(("files", "opened", "message"), UNREAD.values(), ids=UNREAD)
-def test_a_layout_that_is_not_read_is_named_with_what_to_do(
+def test_an_unsupported_layout_is_refused_with_a_remedy(
     tmp_path: Path, files: list[str], opened: str, message: str
 ) -> None:
     root = tmp_path / "data"

@@ -91,7 +91,7 @@ def test_shards_are_put_together_by_a_run_without_one(output: Path, undisturbed:
     assert goes_on(output, undisturbed) == 0
 
 
-def test_an_episode_that_fails_is_told_and_the_others_go_on(output: Path, undisturbed: list[bytes]) -> None:
+def test_a_failing_episode_is_reported_and_the_others_are_labelled(output: Path, undisturbed: list[bytes]) -> None:
     notes, dataset = Notes(), open_dataset(ROOT)
     failing = [episode for episode in dataset.episodes if episode.task == PickyScorer.REFUSED]
     assert failing

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import random
-import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -22,7 +21,6 @@ import hdf5_writers as writers
 from client_commands import invoke
 from hdf5_writers import RGB_MARK, TASK, decoded, jpeg, video
 from labelling import BrightnessScorer, Notes
-from paths import ROOT
 from rfm_client import FrameSize, InvalidSampleError, ProgressResult, ProgressSample, RewardError
 from rfm_client.frames import Correction, resize_frames
 from rfm_labels import CheckpointFacts, DatasetError, LabelOptions, find_label_files, label, open_dataset
@@ -276,17 +274,6 @@ def test_labels_of_two_files_in_a_folder_are_kept_apart(three: Path) -> None:
     assert "demos.gone_progress.parquet: expected a file of labels, got none: label the dataset first" in shown.stderr
 
 
-def test_the_guide_s_lines_copy_a_column_back(three: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    report = label(open_dataset(three), BrightnessScorer())
-    guide = (ROOT / "docs" / "guides" / "label_a_dataset.md").read_text()
-    (code,) = (block for block in re.findall(r"```python\n(.*?)```", guide, re.DOTALL) if "import h5py" in block)
-    monkeypatch.chdir(three.parent)
-    exec(compile(code, "guide", "exec"), {})
-    with h5py.File(three) as opened:
-        copied = np.concatenate([opened[f"data/demo_{index}/rfm_progress"] for index in range(3)])
-    np.testing.assert_array_equal(copied, parquet.read_table(report.files[0])["progress_sparse"].to_numpy())
-
-
 GONE, OUTSIDE = h5py.SoftLink("/nowhere"), h5py.ExternalLink("gone.hdf5", "/data")
 NO_CAMERA = "data/demo_1/obs: expected a camera as uint8 [T, H, W, 3], got front: "
 NOWHERE = "demo_1 has a broken link or no array"
@@ -397,7 +384,7 @@ NOTES: dict[str, tuple[Callable[[Any], object], list[str]]] = {
 
 
 @pytest.mark.parametrize(("change", "lines"), NOTES.values(), ids=NOTES)
-def test_what_is_left_out_or_differs_is_told_and_the_rest_is_labelled(
+def test_notes_list_what_is_left_out_and_the_rest_is_labelled(
     three: Path, change: Callable[[Any], object], lines: list[str]
 ) -> None:
     notes = Notes()

@@ -43,7 +43,7 @@ def cells(output: str) -> dict[str, str]:
 
 @pytest.mark.slow
 @pytest.mark.triton
-def test_both_commands_write_the_same_labels_and_tell_what_they_did(demo_server: Endpoints, output: Path) -> None:
+def test_both_commands_write_the_same_labels_and_print_their_decisions(demo_server: Endpoints, output: Path) -> None:
     words = ("--episodes", "2,3,9", "--frames", 8, "--cameras", "front", "--alias", "sarm_progress")
     served = invoke("label", DATASET, *words, "--output", output, "--url", demo_server.http_url)
     assert (served.exit_code, [line.removeprefix("rfm-client: note: ") for line in served.stderr.splitlines()]) == (
@@ -74,7 +74,7 @@ def test_both_commands_write_the_same_labels_and_tell_what_they_did(demo_server:
 
 
 @pytest.mark.triton
-def test_a_dry_run_tells_what_is_to_be_done_and_writes_nothing(demo_server: Endpoints, output: Path) -> None:
+def test_a_dry_run_prints_the_plan_and_writes_nothing(demo_server: Endpoints, output: Path) -> None:
     result = invoke("label", DATASET, "--dry-run", "--output", output, "--url", demo_server.grpc_url)
     assert result.exit_code == 0, result.stderr
     told = cells(result.stdout)
@@ -100,7 +100,7 @@ def test_a_second_run_scores_nothing_and_a_report_needs_no_server(demo_server: E
         assert cells(report.stdout) == cells(first.stdout)
 
 
-def test_what_the_run_did_not_train_is_told(output: Path) -> None:
+def test_outputs_that_the_training_run_did_not_train_are_listed(output: Path) -> None:
     """Only of labelled outputs, not of preference or similarity."""
     checkpoint = shutil.copytree(MODELS / "rfm" / "1" / "checkpoint", output / "checkpoint")
     heads = "".join(f"train_{head}_head: false, " for head in ("progress", "preference", "success", "similarity"))
@@ -123,7 +123,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("words", "message"), WRONG.values(), ids=WRONG)
-def test_wrong_options_are_told(words: list[str], message: str) -> None:
+def test_wrong_options_are_refused(words: list[str], message: str) -> None:
     result = invoke("label", DATASET, *words)
     assert result.exit_code == ExitCode.USAGE
     assert message in result.stderr

@@ -53,7 +53,7 @@ def test_more_episodes_are_scored_alone_and_fewer_never_replace_more(output: Pat
     assert labels(output) == before
 
 
-def test_a_server_that_names_no_computation_goes_on_with_the_labels_made_before(output: Path) -> None:
+def test_labels_of_a_server_that_names_no_computation_have_no_such_field(output: Path) -> None:
     options = LabelOptions(output=output, cameras=(FRONT,), frames=2, formats=("progress",), episodes=[0])
     label(open_dataset(TOY), BrightnessScorer(computation=None), options)
     metadata = parquet.read_schema(output / PROGRESS).metadata
@@ -145,7 +145,7 @@ BY_OTHERS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("make", BY_OTHERS.values(), ids=BY_OTHERS)
-def test_labels_that_do_not_say_of_what_they_are_stay_unless_asked(
+def test_labels_of_another_program_stay_unless_overwriting_is_requested(
     output: Path, make: Callable[[Path], object]
 ) -> None:
     labelled(TOY, output, limit=1, alias="sarm_progress")

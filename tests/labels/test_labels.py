@@ -203,7 +203,7 @@ def test_the_files_have_the_documented_form(output: Path) -> None:
     assert json.loads(progress.schema.metadata[b"rfm.provenance"]) == provenance
 
 
-def test_the_run_tells_what_was_decided_and_by_whom(output: Path) -> None:
+def test_a_run_prints_each_decision_with_its_reason(output: Path) -> None:
     notes = Notes()
     label(open_dataset(LEROBOT / "toy_v21"), BrightnessScorer(), LabelOptions(output=output, limit=1), notes)
     assert notes.lines == [
@@ -233,7 +233,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize(("options", "message"), REFUSED.values(), ids=REFUSED)
-def test_what_cannot_be_labelled_is_refused_before_the_first_frame(
+def test_unusable_options_are_refused_before_the_first_frame(
     options: dict[str, Any], message: str, output: Path
 ) -> None:
     scorer = BrightnessScorer()

@@ -402,7 +402,7 @@ WITH_NOTES: dict[str, tuple[Break, list[str]]] = {
 
 
 @pytest.mark.parametrize(("change", "notes"), WITH_NOTES.values(), ids=WITH_NOTES)
-def test_what_lerobot_reads_is_read_with_a_note(tmp_path: Path, change: Break, notes: list[str]) -> None:
+def test_oddities_that_lerobot_reads_are_read_with_a_note(tmp_path: Path, change: Break, notes: list[str]) -> None:
     root = shutil.copytree(LEROBOT / "toy_v30_many", tmp_path / "toy")
     change(root)
     dataset, whole = open_dataset(root), open_dataset(LEROBOT / "toy_v30_many")

@@ -102,7 +102,7 @@ TWICE = {
 
 
 @pytest.mark.parametrize(("names", "message"), TWICE.values(), ids=TWICE)
-def test_names_that_do_not_tell_the_order_are_refused(tmp_path: Path, names: Sequence[str], message: str) -> None:
+def test_names_without_a_clear_order_are_refused(tmp_path: Path, names: Sequence[str], message: str) -> None:
     dataset = open_dataset(stored(tmp_path / "pictures", names), task=TASK)
     with pytest.raises(DatasetError) as refused:
         _ = dataset.episodes

@@ -42,7 +42,7 @@ class OpenScorer(BrightnessScorer):
         return super().evaluate(samples)
 
 
-def test_an_actor_opens_the_dataset_as_it_is_told_and_its_scorer_for_as_long_as_it_lives(output: Path) -> None:
+def test_an_actor_opens_the_dataset_with_the_given_options_and_keeps_its_scorer_open(output: Path) -> None:
     scorer, told = OpenScorer(), {"task": "juggle", "override_task": True}
     told |= {"orient": "rotate90", "channels": "bgr"}
 

@@ -225,7 +225,7 @@ NOT_READ: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize(("change", "message"), NOT_READ.values(), ids=NOT_READ)
-def test_what_cannot_be_read_is_refused_with_what_to_do(
+def test_an_unreadable_rlds_folder_is_refused_with_a_remedy(
     copied: Path, change: Callable[[Path], object], message: str
 ) -> None:
     change(copied)

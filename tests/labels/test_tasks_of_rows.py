@@ -153,7 +153,7 @@ def rename_tasks(root: Path, *texts: str) -> None:
     file.write_text("\n".join(json.dumps(line, ensure_ascii=False) for line in lines))
 
 
-def test_outdated_sentences_in_the_metadata_are_told_with_the_option_that_follows_the_rows(tmp_path: Path) -> None:
+def test_outdated_sentences_in_the_metadata_are_refused_with_the_option_that_follows_the_rows(tmp_path: Path) -> None:
     root = Path(shutil.copytree(V21, tmp_path / "toy"))
     rename_tasks(root, "lift the block onto the plate")
     with pytest.raises(DatasetError) as caught:
@@ -179,7 +179,7 @@ def test_a_sentence_may_have_any_character_that_is_no_end_of_a_line(tmp_path: Pa
     assert open_dataset(root, task_column="task_index").episode(0).task == text
 
 
-def test_identifiers_in_place_of_sentences_are_told(tmp_path: Path, output: Path) -> None:
+def test_identifiers_in_place_of_sentences_are_listed(tmp_path: Path, output: Path) -> None:
     root = Path(shutil.copytree(V21, tmp_path / "toy"))
     rename_tasks(root, "PnPCupToDrawerClose", "pick_place_cup", "lift it", "杯子放进抽屉里")
     notes = Notes()
@@ -191,7 +191,7 @@ def test_identifiers_in_place_of_sentences_are_told(tmp_path: Path, output: Path
     ]
 
 
-def test_an_override_is_told_to_be_the_task_of_all(output: Path) -> None:
+def test_a_note_says_that_an_override_is_the_task_of_all_episodes(output: Path) -> None:
     notes = Notes()
     dataset = open_dataset(V21, task="stack the cups", override_task=True)
     label(dataset, BrightnessScorer(), LabelOptions(output=output, limit=3, **FEW), notes)

@@ -54,7 +54,7 @@ def test_a_table_is_read_as_spreadsheets_and_people_write_it(videos: Path, text:
     )
 
 
-def test_videos_beside_a_table_that_it_lacks_are_told(videos: Path, output: Path) -> None:
+def test_videos_missing_from_the_table_are_listed(videos: Path, output: Path) -> None:
     (videos / "tasks.csv").write_text("video,task\nday/a.mp4,open the box\n")
     (videos / "day" / "c.mp4").write_bytes((videos / "b.mp4").read_bytes())
     (videos / "elsewhere").mkdir()

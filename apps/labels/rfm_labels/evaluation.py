@@ -267,7 +267,7 @@ def _agreement(
         one, other = of_first[episode], of_second[episode]
         frames, mine, theirs = np.intersect1d(one.frames, other.frames, assume_unique=True, return_indices=True)
         require(f"labels: episode {episode}", len(frames) > 0, f"a frame that {first} and {second} have", "none")
-        orders.append(spearman(one.progress[mine], other.progress[theirs]))
+        orders.append(_spearman(one.progress[mine], other.progress[theirs]))
         distances.append(np.abs(one.progress[mine].astype(np.float64) - other.progress[theirs]).mean())
     mean = float(np.mean(distances))
     return Agreement(first, second, _mean([order for order in orders if order is not None]), mean)
@@ -275,24 +275,19 @@ def _agreement(
 
 def _order(progress: Floats) -> tuple[float, float] | None:
     """Return Spearman's rho and Kendall's tau-b of progress with time; None: progress is constant."""
+    from scipy.stats import kendalltau
+
     time = np.arange(len(progress))
-    rho, tau = spearman(progress, time), kendall(progress)
-    return None if rho is None or tau is None else (rho, tau)
+    rho = _spearman(progress, time)
+    return None if rho is None else (rho, float(kendalltau(progress, time).statistic))
 
 
-def spearman(first: npt.NDArray[Any], second: npt.NDArray[Any]) -> float | None:
+def _spearman(first: npt.NDArray[Any], second: npt.NDArray[Any]) -> float | None:
     """Return Spearman's rank correlation of two arrays [T]; equal values share a rank. None: an array is constant."""
     from scipy.stats import spearmanr
 
     is_constant = np.ptp(first) == 0 or np.ptp(second) == 0
     return None if is_constant else float(spearmanr(first, second).statistic)
-
-
-def kendall(values: npt.NDArray[Any]) -> float | None:
-    """Return Kendall's tau-b of values [T] with time; None: the values are constant."""
-    from scipy.stats import kendalltau
-
-    return None if np.ptp(values) == 0 else float(kendalltau(values, np.arange(len(values))).statistic)
 
 
 def _ranking(numbers: Floats, is_success: npt.NDArray[np.bool_] | None) -> Ranking | None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -127,7 +128,10 @@ def read_blank(file: Path) -> BlankCameras:
 
 def read_provenance(file: Path) -> dict[str, Any]:
     """Return writer, dataset and recipe of a label file, as far as it tells them. Raises DatasetError."""
-    metadata = _metadata(file)
+    return _provenance(_metadata(file))
+
+
+def _provenance(metadata: Mapping[bytes, bytes]) -> dict[str, Any]:
     return parsed_object(metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY)))
 
 
@@ -202,13 +206,10 @@ class LabelFile:
     @classmethod
     def read(cls, path: Path, option: str = "--name") -> LabelFile:
         """Return what a file tells in its metadata."""
-        from pyarrow import ArrowException, parquet
-
-        try:
-            metadata = parquet.read_schema(path).metadata or {}
-        except (OSError, ArrowException):
-            metadata = {}
-        told = parsed_object(metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY)))
+        metadata: Mapping[bytes, bytes] = {}
+        with suppress(DatasetError):
+            metadata = _metadata(path)
+        told = _provenance(metadata)
         is_own = str(told.get("writer")).startswith("rfm-client") and isinstance(told.get("dataset"), dict)
         by_number = parsed_object(metadata.get(EPISODES_KEY)) if is_own else {}
         digests = {int(number): str(digest) for number, digest in by_number.items() if number.isdecimal()}

@@ -20,7 +20,7 @@ from rfm_labels.datasets.faults import DatasetError
 from rfm_labels.label_files import LabelFile
 from rfm_labels.metadata import PROGRESS, SCORES, Cost, blank_from_metadata, blank_lines
 from rfm_labels.options import DEFAULTS, QUIET, LabelOptions, Watch
-from rfm_labels.plan import Plan, all_faults, plan_labels
+from rfm_labels.plan import Plan, plan_labels
 from rfm_labels.scorer import Scorer
 from rfm_labels.scoring import FailedEpisode, Run
 from rfm_labels.summary import Summary, summary_of
@@ -90,12 +90,6 @@ def planned(dataset: Dataset, scorer: Scorer, outputs: Outputs, watch: Watch = Q
                 raise DatasetError(told, error.where) from error
             labels = f"its labels of {len(file.digests)} episodes are" if file.digests else "it is"
             watch.note(f"--overwrite: {error}; {labels} replaced")
-    watch.checking(len(plan.items))
-    with all_faults(dataset, options):
-        for item in plan.items:
-            for camera in plan.recipe.decoded_cameras:
-                dataset.check(item.episode, camera)
-            watch.checked(item.episode)
     return plan
 
 

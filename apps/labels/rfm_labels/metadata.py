@@ -59,15 +59,6 @@ def skipping_in(names: Iterable[str]) -> str | None:
     return next((name for name in names if name in SCORES and SCORES[name].skips_frames), None)
 
 
-def blank_by_camera(of_episodes: Iterable[tuple[int, Mapping[str, int]]]) -> BlankCameras:
-    """Return the blank cameras of all episodes. of_episodes: episode numbers with the blank cameras of each"""
-    found: dict[str, dict[int, int]] = {}
-    for episode, blank in of_episodes:
-        for camera, highest in blank.items():
-            found.setdefault(camera, {})[episode] = highest
-    return found
-
-
 def blank_to_metadata(blank: BlankCameras) -> dict[bytes, bytes]:
     """Return label metadata with these blank cameras; empty if there are none."""
     return {BLANK_KEY: json.dumps(blank, sort_keys=True).encode()} if blank else {}

@@ -6,8 +6,7 @@ from __future__ import annotations
 import importlib.metadata
 import itertools
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -233,17 +232,6 @@ class Plan:
         return {"writer": f"rfm-client {version}", "dataset": dataset, **self.recipe.document()}
 
 
-def selected(dataset: Dataset, options: LabelOptions) -> list[DatasetEpisode]:
-    """Return the episodes that the options choose; the others are not read.
-
-    Raises DatasetError for an episode that the dataset lacks, or that cannot be read.
-    """
-    episodes = dataset.read(chosen_numbers(dataset, options))
-    if options.shard is None:  # the episodes of another shard may need the task
-        dataset.given_task.check_used(episodes)
-    return episodes
-
-
 def chosen_cameras(
     dataset: Dataset, options: LabelOptions, numbers: Sequence[int]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -287,36 +275,34 @@ def _check_views(options: LabelOptions, cameras: Sequence[str], checkpoint: Chec
         raise InvalidSampleError.at("views", expected, ", ".join(cameras), remedy)
 
 
-@contextmanager
-def all_faults(dataset: Dataset, options: LabelOptions) -> Iterator[None]:
-    """Replace the error of a single episode by FaultsError with the faults of all chosen episodes.
+def checked_episodes(dataset: Dataset, options: LabelOptions, watch: Watch = QUIET) -> list[DatasetEpisode]:
+    """Return the chosen episodes, once their tables and frames are checked, without decoding. Others are not read.
 
-    Other errors pass. A shard reports the faults of all shards, because all need the same episodes.
+    Raises FaultsError with the faults of all of them, and of those of all shards, because all need the same episodes;
+    DatasetError for an episode that the dataset lacks.
     """
-    try:
-        yield
-    except RewardError:
-        check_episodes(dataset, options)
-        raise
-
-
-def check_episodes(dataset: Dataset, options: LabelOptions) -> None:
-    """Check the tables and frames of all chosen episodes, without decoding. Raises FaultsError, DatasetError."""
-    numbers = chosen_numbers(dataset, replace(options, shard=None))
-    cameras, views = chosen_cameras(dataset, options, numbers)
+    numbers, everywhere = (chosen_numbers(dataset, each) for each in (options, replace(options, shard=None)))
+    cameras, views = chosen_cameras(dataset, options, everywhere)
+    episodes: list[DatasetEpisode] = []
     faults: dict[int, RewardError] = {}
-    before: list[DatasetEpisode] = []
+    watch.checking(len(numbers))
     for number in numbers:
         try:
             episode = dataset.episode(number)
-            check_order([*before[-1:], episode])
-            for camera in (*cameras, *views):
+            check_order([*episodes[-1:], episode])
+            for camera in dict.fromkeys((*cameras, *views)):
                 dataset.check(episode, camera)
-            before.append(episode)
+            episodes.append(episode)
+            watch.checked(episode)
         except RewardError as fault:
             faults[number] = fault
+    if faults and options.shard is not None:
+        checked_episodes(dataset, replace(options, shard=None))  # raises
     if faults:
         raise FaultsError.of(faults, numbers)
+    if options.shard is None:  # the episodes of another shard may need the task
+        dataset.given_task.check_used(episodes)
+    return episodes
 
 
 def check_order(episodes: Sequence[DatasetEpisode]) -> None:
@@ -329,14 +315,12 @@ def check_order(episodes: Sequence[DatasetEpisode]) -> None:
 
 
 def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch = QUIET) -> Plan:
-    """Check everything except the frames, report decisions to ``watch``, and return the plan.
+    """Check the dataset, report decisions to ``watch``, and return the plan.
 
     Raises DatasetError, RewardError if the scorer does not answer, ValueError if the rule lacks its number of frames.
     """
     recipe = Recipe.of(options, dataset, scorer.checkpoint())
-    with all_faults(dataset, options):
-        episodes = selected(dataset, options)
-        check_order(episodes)
+    episodes = checked_episodes(dataset, options, watch)
     recipe.check_lengths(episodes)
     several = sum(bool(episode.tasks) for episode in episodes)
     if several:
@@ -357,8 +341,7 @@ def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: 
     tasks = _tasks_told(dataset, episodes)
     for line in (*recipe.told(options), *left_out, *dataset.notes, *turned, *swapped, *tasks):
         watch.note(line)
-    with all_faults(dataset, options):
-        return make_plan(dataset, recipe, episodes)
+    return make_plan(dataset, recipe, episodes)
 
 
 def _tasks_told(dataset: Dataset, episodes: Sequence[DatasetEpisode]) -> list[str]:
@@ -372,15 +355,10 @@ def _tasks_told(dataset: Dataset, episodes: Sequence[DatasetEpisode]) -> list[st
     return lines + _identifiers_told(task for episode in episodes for task, _ in episode.stretches)
 
 
-def _is_identifier(task: str) -> bool:
-    """True if a task is a single word of ASCII, such as ``PnPCupToDrawerClose`` or ``pick_place_cup``."""
-    return task.isascii() and len(task.split()) == 1
-
-
 def _identifiers_told(tasks: Iterable[str]) -> list[str]:
-    """Return a line that lists single-word tasks; empty if all tasks are sentences."""
+    """Return a line that lists tasks of one ASCII word, such as ``pick_place_cup``; empty if there are none."""
     known = dict.fromkeys(tasks)
-    found = [task for task in known if _is_identifier(task)]
+    found = [task for task in known if task.isascii() and len(task.split()) == 1]
     if not found:
         return []
     remedy = "--task with --override-task gives all episodes a sentence, --task-column reads another column (LeRobot)"

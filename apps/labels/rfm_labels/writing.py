@@ -36,7 +36,6 @@ from rfm_labels.metadata import (
     SUCCESS,
     Columns,
     Cost,
-    blank_by_camera,
     blank_from_metadata,
     blank_to_metadata,
     canonical_json,
@@ -102,7 +101,7 @@ class Parts:
         count, first = item.episode.num_frames, item.episode.first_index
         rows = (np.arange(first, first + count), np.full(count, item.episode.index), np.arange(count))
         identity = {name: values.astype(np.int64) for name, values in zip(IDENTITY, rows, strict=True)}
-        about = blank_to_metadata(blank_by_camera([(item.episode.index, blank)]))
+        about = blank_to_metadata({camera: {item.episode.index: highest} for camera, highest in blank.items()})
         table = pa.table({**identity, **columns}).replace_schema_metadata({_DIGEST_KEY: item.digest, **about})
         content = io.BytesIO()
         parquet.write_table(table, content)
@@ -141,7 +140,7 @@ class Parts:
         import pyarrow as pa
 
         tables: list[Any] = []
-        blank: list[tuple[int, Mapping[str, int]]] = []
+        blank: dict[str, dict[int, int]] = {}
         following = -1
         for item in plan.items:
             table, name, first = self.read(item), item.episode.name, item.episode.first_index
@@ -149,11 +148,10 @@ class Parts:
             require(name, table.column_names == names, f"the columns {', '.join(names)}", ", ".join(table.column_names))
             require(name, first > following, f"rows after {following}", first)
             following = first + item.episode.num_frames - 1
-            told = blank_from_metadata(table.schema.metadata)
-            blank += [(episode, {camera: value}) for camera, of in told.items() for episode, value in of.items()]
+            for camera, highest in blank_from_metadata(table.schema.metadata).items():
+                blank.setdefault(camera, {}).update(highest)
             tables.append(table.replace_schema_metadata(None))
-        about = blank_to_metadata(blank_by_camera(blank))
-        return pa.concat_tables(tables).replace_schema_metadata(about)
+        return pa.concat_tables(tables).replace_schema_metadata(blank_to_metadata(blank))
 
     def _path(self, item: Item) -> str:
         return f"{self._root}/{item.key}{_SUFFIX}"

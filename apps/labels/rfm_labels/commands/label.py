@@ -26,7 +26,7 @@ from rfm_labels.labelling import Outputs, Report, planned
 from rfm_labels.labelling import label as label_dataset
 from rfm_labels.metadata import blank_lines
 from rfm_labels.options import LabelOptions, RayOptions, Watch
-from rfm_labels.plan import check_episodes, selected
+from rfm_labels.plan import checked_episodes
 from rfm_labels.ray_engine import Connect, label_with_ray
 from rfm_labels.scorer import ClientScorer, Scorer
 from rfm_labels.summary import Summary, summarise
@@ -257,8 +257,7 @@ class LabelCommand:
         for command in commands:
             try:
                 dataset = command._dataset()
-                check_episodes(dataset, self.labels)
-                selected(dataset, self.labels)
+                checked_episodes(dataset, self.labels)
             except UnusedTaskError as error:
                 unused.append(error)
                 command = replace(command, texts=replace(command.texts, task=None))

@@ -32,27 +32,6 @@ def shortened(lines: Sequence[str]) -> list[str]:
     return [*lines[:_MOST_SHOWN], *([f"... and {more} more"] if more > 0 else [])]
 
 
-def fault_lines(faults: Mapping[int, str], numbers: Sequence[int], num_without_task: int) -> list[str]:
-    """Return one line per distinct fault, then the options that help.
-
-    faults: messages by episode number
-    numbers: chosen episodes, with or without a fault
-    num_without_task: number of episodes without a task
-    """
-    alike: dict[str, list[int]] = {}
-    for number, fault in faults.items():
-        alike.setdefault(fault, []).append(number)
-    told = [fault if len(of) == 1 else f"{fault} (episodes {listed(of)})" for fault, of in alike.items()]
-    head = f"episodes: expected {len(numbers)} that can be labelled, got {len(faults)} with faults:"
-    lines = [*[head] * (len(told) > 1), *shortened(told)]
-    if num_without_task > 1:
-        lines.append(f'for the {num_without_task} without a task: --task "SENTENCE"')
-    others = [number for number in numbers if number not in faults]
-    if others:
-        lines.append(f"to continue without the faulty episodes: --episodes {listed(others)}")
-    return lines
-
-
 class DatasetError(RewardError, InvalidValueError):
     """A contradictory or unreadable dataset. where: a file, or a place in it"""
 
@@ -86,10 +65,23 @@ class FaultsError(DatasetError):
 
     @classmethod
     def of(cls, faults: Mapping[int, RewardError], numbers: Sequence[int]) -> FaultsError:
-        """Return the error of these episodes. numbers: of all chosen episodes"""
-        without_task = [fault for fault in faults.values() if isinstance(fault, MissingTaskError)]
-        messages = {number: str(fault) for number, fault in faults.items()}
-        return cls.listing(fault_lines(messages, numbers, len(without_task)))
+        """Return the error of these episodes: a line for each distinct fault, then the options that help.
+
+        numbers: of all chosen episodes
+        """
+        alike: dict[str, list[int]] = {}
+        for number, fault in faults.items():
+            alike.setdefault(str(fault), []).append(number)
+        told = [text if len(those) == 1 else f"{text} (episodes {listed(those)})" for text, those in alike.items()]
+        head = f"episodes: expected {len(numbers)} that can be labelled, got {len(faults)} with faults:"
+        lines = [*[head] * (len(told) > 1), *shortened(told)]
+        num_without_task = sum(isinstance(fault, MissingTaskError) for fault in faults.values())
+        if num_without_task > 1:
+            lines.append(f'for the {num_without_task} without a task: --task "SENTENCE"')
+        others = [number for number in numbers if number not in faults]
+        if others:
+            lines.append(f"to continue without the faulty episodes: --episodes {listed(others)}")
+        return cls.listing(lines)
 
 
 require = partial(require_that, error=DatasetError)

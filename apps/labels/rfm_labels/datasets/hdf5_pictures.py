@@ -154,14 +154,11 @@ def is_encoded(value: Any, are_pictures: bool) -> bool:
     kinds = {1: "OSV", 2: "u"}
     if not value.shape or not value.shape[0] or value.dtype.kind not in kinds.get(len(value.shape), ""):
         return False
-    try:
-        return are_pictures or bool(np.asarray(value[0]).tobytes().startswith(_STARTS))
-    except (OSError, RuntimeError):  # refused when read
-        return False
+    return are_pictures or _first_file(value).startswith(_STARTS)
 
 
 def _first_file(value: Any) -> bytes:
-    """The first frame's file; empty if it cannot be read."""
+    """The first frame's file; empty if it cannot be read, which is an error when all are read."""
     try:
         return np.asarray(value[0]).tobytes()
     except (OSError, RuntimeError):

@@ -20,6 +20,7 @@ from rfm_client.options import first_names
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER, AskedCorrections, Dataset, SeveralTasks, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, FaultsError, require, shortened
 from rfm_labels.datasets.folders import (
+    PICTURE_SUFFIXES,
     ArrayFiles,
     Contents,
     EpisodeFiles,
@@ -327,13 +328,10 @@ def _unread(path: Path) -> str | None:
         return f"a folder of HDF5 files, each a dataset of its own: {remedy}"
     if any(_is_frame(file) for file in path.iterdir()):
         return "pictures outside of the folder of an episode"
-    deeper = next(
-        (file for file in path.rglob("*") if is_picture(file) or file.suffix.lower() in _VIDEO_SUFFIXES), None
-    )
+    suffixes = {**dict.fromkeys(_VIDEO_SUFFIXES, "videos"), **dict.fromkeys(PICTURE_SUFFIXES, "pictures")}
+    deeper = next((file for file in path.rglob("*") if file.suffix.lower() in suffixes), None)
     if deeper is None:
         return None
-    if is_picture(deeper):
-        listed = deeper.parent.relative_to(path)
-        return f"pictures in deeper folders: list the folders of one camera ({listed}) in tasks.csv"
-    listed = deeper.relative_to(path)
-    return f"videos in deeper folders: list those of one camera ({listed}) in tasks.csv, with their tasks"
+    kind = suffixes[deeper.suffix.lower()]
+    what, listed = ("videos", deeper) if kind == "videos" else ("folders", deeper.parent)
+    return f"{kind} in deeper folders: list the {what} of one camera ({listed.relative_to(path)}) in tasks.csv"
