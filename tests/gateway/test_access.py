@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import base64
-import logging
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -17,7 +16,6 @@ from gateways import TestClient, inside
 from rfm_client.contract.process import LogLines
 from rfm_client.options import ConfigError
 from rfm_gateway import GatewayConfig
-from rfm_gateway.refusals import PERIOD_S, LimitedLog
 from shown_datasets import copied
 
 KEY, LAB, OWN = "open sesame", "http://lab.example", "http://127.0.0.1"
@@ -46,6 +44,7 @@ def coded(text: str) -> str:
 
 KEYS: dict[str, tuple[dict[str, Any], bool]] = {
     "X-API-Key": ({"X-API-Key": KEY}, True),
+    "by any name of the host": ({"X-API-Key": KEY, "Host": "evil.example.com"}, True),
     "Bearer": ({"Authorization": f"Bearer {KEY}"}, True),
     "none": ({}, False),
     "another": ({"X-API-Key": "sesame"}, False),
@@ -111,11 +110,6 @@ def test_a_name_that_anybody_could_own_gets_nothing_without_a_key(
                 )
         for host in answered:
             assert client.get("/metrics", headers={"Host": host}).status_code == 200, host
-
-
-def test_with_a_key_every_host_is_answered(locked: TestClient) -> None:
-    assert locked.get("/metrics", headers={"Host": FOREIGN[0], "X-API-Key": KEY}).status_code == 200
-    assert locked.get("/metrics", headers={"Host": FOREIGN[0]}).status_code == 401
 
 
 @pytest.mark.parametrize(
@@ -203,44 +197,24 @@ def test_an_allowed_origin_may_ask_and_no_other(locked: TestClient, gateway: Tes
 
 
 FAULTY = dumped([progress(FIRST), progress({"task": 5}), of_frames("a")])
-LOGGED: dict[str, tuple[str, str, dict[str, Any], str]] = {
-    "the first of two faults": (
-        "POST",
-        "/evaluate_batch",
-        {"content": FAULTY},
-        "422 POST /evaluate_batch for testclient (testclient): 1.trajectory.task: expected text, got 5 (and 1 more)",
-    ),
-    "a foreign page": (
-        "GET",
-        "/health",
-        {"headers": {"Origin": OWN + ":1"}},
-        f"403 GET /health for testclient (testclient): origin: expected the gateway's own, got '{OWN}:1'; start the "
-        "gateway with --cors-origin (rfm serve: --gateway-cors-origin) to allow it",
-    ),
-    "an unknown path": (
-        "GET",
-        "/x?key=1",
-        {"headers": {"User-Agent": "REALM/1"}},
-        "404 GET /x for testclient (REALM/1): Not Found",
-    ),
-}
 
 
-@pytest.mark.parametrize(("method", "path", "options", "line"), LOGGED.values(), ids=LOGGED)
-def test_a_refusal_is_a_line_with_status_caller_reason_and_request_id(
-    caplog: pytest.LogCaptureFixture, method: str, path: str, options: dict[str, Any], line: str
-) -> None:
+def test_a_refusal_is_a_line_with_status_caller_reason_and_request_id(caplog: pytest.LogCaptureFixture) -> None:
     caplog.handler.setFormatter(LogLines("rfm-gateway"))
-    with inside(KEY) as client:
-        response = client.request(
-            method, path, **{**options, "headers": {"X-API-Key": KEY} | options.get("headers", {})}
-        )
+    with inside() as client:
+        faulty = client.post("/evaluate_batch", content=FAULTY)
+        unknown = client.get("/x?key=1", headers={"User-Agent": "REALM/1"})
         assert client.get("/docs").status_code == 200  # no line
-    (found,) = [each for each in caplog.text.splitlines() if "rfm-gateway" in each and "testclient" in each]
-    head, _, message = found.partition(": ")
-    assert message == line
-    assert head.endswith(f"request={response.headers['X-Request-ID']}")
-    assert " WARNING " in head
+    lines = [each for each in caplog.text.splitlines() if "rfm-gateway" in each and "for testclient" in each]
+    told = [
+        "422 POST /evaluate_batch for testclient (testclient): 1.trajectory.task: expected text, got 5 (and 1 more)",
+        "404 GET /x for testclient (REALM/1): Not Found",
+    ]
+    for line, response, message in zip(lines, (faulty, unknown), told, strict=True):
+        head, _, found = line.partition(": ")
+        assert found == message
+        assert head.endswith(f"request={response.headers['X-Request-ID']}")
+        assert " WARNING " in head
 
 
 def test_what_triton_fails_is_a_line_and_refused_evaluations_are_counted_with_their_id(
@@ -256,18 +230,6 @@ def test_what_triton_fails_is_a_line_and_refused_evaluations_are_counted_with_th
     found, *_ = [record.getMessage() for record in caplog.records if record.name == "rfm_gateway.refusals"]
     assert found.startswith("503 POST /evaluate_batch for testclient (testclient): ")
     assert "connect" in found
-
-
-def test_many_lines_do_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
-    now_s = 0.0
-    log = LimitedLog(logging.getLogger("rfm_gateway"), 2, "more requests were refused", lambda: now_s)
-    with caplog.at_level(logging.WARNING, "rfm_gateway"):
-        for number in range(5):
-            log.write(f"line {number}")
-        for number in (5, 6):
-            now_s += PERIOD_S
-            log.write(f"line {number}")
-    assert caplog.messages == ["line 0", "line 1", "3 more requests were refused", "line 5", "line 6"]
 
 
 @pytest.mark.parametrize("path", ["/health", "/gpu_status", "/model_info", "/viewer/served", "/evaluate_batch"])

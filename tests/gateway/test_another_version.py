@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The checkpoint is replaced while the gateway asks. A stand-in replaces it when a test wants."""
+"""The checkpoint is replaced, late or missing while the gateway asks. A stand-in for Triton does it when a test wants."""
 
 from __future__ import annotations
 
@@ -55,6 +55,11 @@ def test_prefixes_that_several_versions_scored_are_no_curve() -> None:
         assert message.startswith("model_version: expected one for all frames, got ")
         (values,) = answered(ask_json(client, [SAMPLE], use_frame_steps=True))["outputs_progress"]["progress_pred"]
         assert len(values) == 4
+
+
+def test_a_model_that_answers_no_probe_in_time_may_be_busy_and_is_healthy() -> None:
+    with inside(triton=StandIn(served=["rfm"]), metrics_url="http://127.0.0.1:1/metrics") as client:
+        assert client.get("/health").json()["status"] == "healthy"
 
 
 LOST = {"rfm": FIRST, "rfm_encoder": {**FIRST, "text_embedding": None}, "rfm_frames": SAMPLE["trajectory"]}

@@ -9,8 +9,6 @@ import re
 import resource
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -29,27 +27,19 @@ from servers import Endpoints
 KEY = "open sesame"
 
 
-@contextmanager
-def few_descriptors(free: int) -> Iterator[None]:
-    """Leave this process and those it starts ``free`` descriptors."""
-    count = sum(1 for _ in Path("/proc/self/fd").iterdir()) + free
+def test_a_gateway_opens_all_the_files_that_it_may_and_needs_the_key_of_its_variable(tmp_path: Path) -> None:
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (count, limits[1]))
+    num_open = sum(1 for _ in Path("/proc/self/fd").iterdir())
+    resource.setrlimit(resource.RLIMIT_NOFILE, (num_open + 256, limits[1]))  # which the gateway inherits
     try:
-        yield
+        with running(Endpoints.free(), tmp_path, RFM_GATEWAY_API_KEY=KEY) as gateway:
+            soft, hard = resource.prlimit(gateway.process.pid, resource.RLIMIT_NOFILE)
+            assert soft == min(hard, MOST)
+            assert gateway.get("/metrics", headers={"X-API-Key": KEY}).ok
+            assert gateway.get("/metrics").status_code == 401
+            assert KEY not in gateway.log
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, limits)
-
-
-def test_a_gateway_opens_all_the_files_that_it_may_and_needs_the_key_of_its_variable(tmp_path: Path) -> None:
-    with ExitStack() as stack:
-        with few_descriptors(256):
-            gateway = stack.enter_context(running(Endpoints.free(), tmp_path, RFM_GATEWAY_API_KEY=KEY))
-        soft, hard = resource.prlimit(gateway.process.pid, resource.RLIMIT_NOFILE)
-        assert soft == min(hard, MOST)
-        assert gateway.get("/metrics", headers={"X-API-Key": KEY}).ok
-        assert gateway.get("/metrics").status_code == 401
-        assert KEY not in gateway.log
 
 
 @pytest.mark.parametrize("has_key", [True, False])

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -33,12 +33,9 @@ from gateway_requests import (
     preference,
     progress,
 )
-from gateways import WITHIN_S, Gateway, StandIn, answers, free_port, inside, poll
-from rfm_client import AsyncRewardClient, ServerUnavailableError
+from gateways import Gateway, answers, free_port, inside
 from rfm_client.serving import ServerStatus
-from rfm_gateway import GatewayConfig
-from rfm_gateway.state import STALL_S, ServedParts, TritonState
-from servers import Serving, serving
+from servers import Serving, serving, wait_for
 
 pytestmark = pytest.mark.triton
 
@@ -81,32 +78,24 @@ def test_scoring_is_healthy_without_triton_s_metrics(triton: Triton) -> None:
 def test_a_server_that_hangs_is_unhealthy_with_the_reason(triton: Triton, tiny: Gateway) -> None:
     assert tiny.get("/health").ok
     with paused(triton):  # the earlier state is reported for another second
-        poll(lambda: tiny.get("/health").status_code == 503)
+        wait_for(lambda: tiny.get("/health").status_code == 503)
         assert "no answer within" in failure(tiny.get("/health"), 503)
-    poll(lambda: tiny.get("/health").ok)
+    wait_for(lambda: tiny.get("/health").ok)
 
 
-@pytest.mark.slow
-def test_a_model_that_works_is_healthy_until_it_finishes_nothing_for_long(triton: Triton) -> None:
-    """A stand-in is late with its probes, beside the real Triton's statistics."""
-    config, now_s = GatewayConfig(triton=triton.endpoints.grpc_url, metrics_url=triton.endpoints.metrics_url), 0.0
+def test_the_devices_are_busy_while_a_request_waits(triton: Triton, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = ServerStatus.read
 
-    async def ask() -> None:
-        nonlocal now_s
-        late = StandIn(served=["rfm"])
-        async with AsyncRewardClient("", transports=[late], retry=False) as client:
-            state = TritonState(client, config, ServedParts(), clock_s=lambda: now_s)
-            assert (await state.health()).status == "healthy"
-            now_s += STALL_S
-            hangs = r"rfm: no answer within 1\.5 s, and nothing finished for 30 s"
-            with pytest.raises(ServerUnavailableError, match=hangs):
-                await state.health()
-            status = await config.status(WITHIN_S)
-            waiting = replace(status, models=[replace(model, requests_pending=1) for model in status.models])
-            answer = state._gpu_status(waiting)
-            assert (answer.available_gpus, answer.total_gpus, answer.gpu_stats["0"].status) == (0, 1, "processing")
+    def waiting(*arguments: Any, **options: Any) -> ServerStatus:
+        status = read(*arguments, **options)
+        return replace(status, models=[replace(model, requests_pending=1) for model in status.models])
 
-    asyncio.run(ask())
+    monkeypatch.setattr(ServerStatus, "read", waiting)
+    ends = triton.endpoints
+    with inside(triton=ends.grpc_url, model=TINY, metrics_url=ends.metrics_url) as gateway:
+        status = gateway.get("/gpu_status").json()
+    told = (status["available_gpus"], status["total_gpus"], status["gpu_stats"]["0"]["status"])
+    assert told == (0, 1, "processing")
 
 
 def test_model_info_tells_the_checkpoint_and_its_training_run(
@@ -172,11 +161,11 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed_or_si
         ["--gateway-timeout=90", "--gateway-max-waiting=7", "--triton-silent-s=4"],
     )
     with serving(repository, f"--gateway-port={port}", *options) as served:
-        poll(lambda: served.process.poll() is not None or answers(url))
+        wait_for(lambda: served.process.poll() is not None or answers(url))
         gateway = Gateway(url, TINY, served.endpoints.grpc_url, served.process, served.log)
 
         def scores() -> None:
-            poll(lambda: answers(url))
+            wait_for(lambda: answers(url))
             assert answered(ask_json(gateway, [progress(FIRST)])) == expected(gateway, [progress(FIRST)])
 
         scores()
@@ -184,11 +173,11 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed_or_si
         assert "--timeout 90.0 --max-body-mib 512" in " ".join(first.cmdline())
         assert "--max-waiting 7" in " ".join(first.cmdline())
         first.kill()
-        poll(lambda: not answers(url))
+        wait_for(lambda: not answers(url))
         scores()
         second = own_gateway(served)
         second.suspend()
-        poll(lambda: not second.is_running())
+        wait_for(lambda: not second.is_running())
         scores()
         started = [first, second, *psutil.Process(served.process.pid).children(recursive=True)]
     assert served.process.returncode == 0

@@ -23,10 +23,10 @@ from selenium.webdriver.support.select import Select
 
 import clip
 from browsers import REBOUND, Browser
-from gateways import Gateway, poll, running
+from gateways import Gateway, running
 from paths import VIDEOS
 from rfm_client.frames import ChannelOrder, Correction, Orientation
-from servers import Endpoints, folder_server
+from servers import Endpoints, folder_server, wait_for
 from tolerances import SHOWN, TOLERANCE
 from toy_world import Task, make_clip
 from viewer_requests import by_command_line
@@ -116,16 +116,12 @@ def test_dropped_clips_get_the_curves_of_the_command_line(page: Page) -> None:
         assert (shown["num_frames"], shown["model_version"]) == (video["num_frames"], video["model_version"])
         last = [video[name][-1] for name in ("progress", "success")]
         assert [float(text) for text in row[5:7]] == pytest.approx(last, abs=SHOWN + TOLERANCE)
-    poll(lambda: page.is_at(1.5))
+    wait_for(lambda: page.is_at(1.5))
     ends = [each[name][-1] for name in SIGNALS for each in videos]
     assert page.beside_the_lines() == pytest.approx(ends, abs=2 * SHOWN)  # which stand there
     assert "success.mp4: put the red block in the bowl" in page.browser["chart"].get_attribute("aria-label")
     for threshold in (0.5, 1.0):
-        page.browser.run(
-            "const slider = document.getElementById('threshold'); slider.value = arguments[0]; "
-            "slider.dispatchEvent(new Event('input'))",
-            threshold,
-        )
+        page.browser.enter("#threshold", threshold)
         first = [np.flatnonzero(np.array(video["success"]) >= threshold) for video in document["videos"]]
         told = [f"{index[0] / FPS:.2f} s" if len(index) else "-" for index in first]
         assert [row[7] for row in page.browser.cells("#curves tr")] == told
@@ -160,7 +156,7 @@ def test_a_person_sees_what_the_model_sees(page: Page) -> None:
     np.testing.assert_allclose(told["progress"], video["progress"], rtol=0, atol=TOLERANCE)
 
     page.browser["time"].send_keys(Keys.HOME)
-    poll(lambda: page.is_at(0))
+    wait_for(lambda: page.is_at(0))
     corrections = [Correction(*both) for both in itertools.product(get_args(Orientation), get_args(ChannelOrder))]
     for correction in corrections:
         Select(page.browser["orient"]).select_by_value(correction.orient)
@@ -179,25 +175,25 @@ def test_the_pointer_the_keys_and_the_button_move_the_videos_and_the_numbers(pag
     (over,) = page.browser.all(".u-over")
     width = over.size["width"]
     ActionChains(page.browser.driver).move_to_element(over).perform()  # pointing is enough
-    poll(lambda: page.is_at(1.5 / 2, 0.02))
+    wait_for(lambda: page.is_at(1.5 / 2, 0.02))
     ActionChains(page.browser.driver).move_to_element_with_offset(over, -width // 4, 0).click_and_hold().perform()
-    poll(lambda: page.is_at(1.5 / 4, 0.02))
+    wait_for(lambda: page.is_at(1.5 / 4, 0.02))
     ActionChains(page.browser.driver).move_by_offset(width // 2, 0).release().perform()
-    poll(lambda: page.is_at(1.5 * 3 / 4, 0.02))
+    wait_for(lambda: page.is_at(1.5 * 3 / 4, 0.02))
     expected = [video[name][11] for name in SIGNALS for video in page.saved()["videos"]]
     assert page.beside_the_lines() == pytest.approx(expected, abs=SHOWN)
     told = page.browser["time"].get_attribute("aria-valuetext")
     assert told.startswith("1.1")
     assert f"progress {expected[0]:.3f}, success {expected[2]:.3f}" in told
     page.browser["time"].send_keys(Keys.HOME)
-    poll(lambda: page.is_at(0))
+    wait_for(lambda: page.is_at(0))
     for key, time_s in ((Keys.ARROW_RIGHT, 0.1), (Keys.ARROW_RIGHT, 0.2), (Keys.ARROW_LEFT, 0.1)):
         page.browser["time"].send_keys(key)
-        poll(lambda time_s=time_s: page.is_at(time_s))  # type: ignore[misc]
+        wait_for(lambda time_s=time_s: page.is_at(time_s))  # type: ignore[misc]
     page.browser["play"].click()
     page.browser.until_text("play", "Pause")
     seen = [0.1]
-    poll(lambda: seen.append(page.browser.times_s(PLAYERS)[-1]) or seen[-1] == pytest.approx(1.5))  # type: ignore[func-returns-value]
+    wait_for(lambda: seen.append(page.browser.times_s(PLAYERS)[-1]) or seen[-1] == pytest.approx(1.5))  # type: ignore[func-returns-value]
     assert len(set(seen)) > 2
     assert sorted(seen) == seen
     page.browser.until_text("play", "Play")
@@ -280,7 +276,7 @@ def test_a_link_has_the_settings_which_fold_away_and_says_if_its_model_is_not_se
     assert page.browser["tasks"].get_attribute("value") == "go"
     assert page.browser["errors"].text == ""
     page.browser.write("fps", "2")
-    poll(lambda: page.browser.run("return location.hash") == f"#{link.replace('fps=5', 'fps=2')}")
+    wait_for(lambda: page.browser.run("return location.hash") == f"#{link.replace('fps=5', 'fps=2')}")
     page.browser.driver.get("about:blank")
     page.browser.open(f"{page.gateway.url}/#model=gone")
     assert page.browser["errors"].text.startswith("The model gone is not served here")
@@ -302,11 +298,20 @@ def captions(page: Page) -> list[str]:
     return [str(name.get_attribute("textContent")) for name in page.browser.all("#videos .nameable button")]
 
 
+def figure(page: Page) -> ElementTree.Element:
+    """Return the figure that the page saves."""
+    page.browser["svg"].click()
+    return ElementTree.fromstring(page.browser.saved("curves.svg"))
+
+
+def texts(svg: ElementTree.Element) -> list[str | None]:
+    return [element.text for element in svg.iter(f"{SVG}text")]
+
+
 def lines(page: Page) -> set[tuple[str, str]]:
     """Return the colour and the dash of each curve in the figure."""
-    page.browser["svg"].click()
-    svg = ElementTree.fromstring(page.browser.saved("curves.svg"))
-    return {(line.attrib["stroke"], line.attrib.get("stroke-dasharray", "")) for line in svg.iter(f"{SVG}polyline")}
+    curves = figure(page).iter(f"{SVG}polyline")
+    return {(line.attrib["stroke"], line.attrib.get("stroke-dasharray", "")) for line in curves}
 
 
 def test_twelve_videos_have_twelve_colours_and_whole_names(page: Page) -> None:
@@ -346,26 +351,16 @@ def test_tasks_are_overlaid_colours_tell_videos_apart_and_lines_tell_tasks_apart
     found = lines(page)
     assert len(found) == 4
     assert [len({line[part] for line in found}) for part in (0, 1)] == [2, 2]
-    page.browser["svg"].click()
-    svg = ElementTree.fromstring(page.browser.saved("curves.svg"))
-    texts = [element.text for element in svg.iter(f"{SVG}text")]
-    assert texts[:3] == ["2 tasks", "2 videos", "demo_checkpoint/checkpoint"]
-    assert texts[-4:] == [
-        "success.mp4",
-        "failure.mp4",
-        TASK,
-        OTHER_TASK,
-    ]  # a colour for each video, then a line for each task
+    told = texts(figure(page))
+    assert told[:3] == ["2 tasks", "2 videos", "demo_checkpoint/checkpoint"]
+    assert told[-4:] == ["success.mp4", "failure.mp4", TASK, OTHER_TASK]  # each video's colour, then each task's line
     page.browser.all("#legend .remove")[1].click()
     assert [row[1] for row in page.browser.cells("#curves tr")] == [TASK, TASK]
     assert legend(page) == []
     page.browser.all("#videos .nameable button")[0].click()
     page.browser.all("#videos .nameable input")[0].send_keys("dropped", Keys.ENTER)
     assert captions(page) == ["dropped", "failure.mp4"]
-    page.browser.run(
-        "const colour = document.querySelector('#videos [type=color]'); colour.value = '#ff00ff'; "
-        "colour.dispatchEvent(new Event('input'))"
-    )
+    page.browser.enter("#videos [type=color]", "#ff00ff")
     assert "#ff00ff" in {colour for colour, _ in lines(page)}
     assert [video["source"] for video in page.saved()["videos"]] == ["success.mp4", "failure.mp4"]  # the files' names
 
@@ -411,15 +406,13 @@ def test_the_figure_fits_a_column_of_a_paper_and_is_light(page: Page) -> None:
         page.score("success", "failure")
         page.browser["png"].click()
         picture = Image.open(io.BytesIO(page.browser.saved("curves.png"))).convert("RGB")
-        page.browser["svg"].click()
-        svg = ElementTree.fromstring(page.browser.saved("curves.svg"))
+        svg = figure(page)
     assert picture.width == 2100
     assert np.asarray(picture)[[0, 0, -1], [0, -1, -1]].tolist() == [[255] * 3] * 3
     assert (np.asarray(picture).std(axis=2) > 20).any()  # the coloured lines
     assert svg.attrib["width"] == "252pt"
-    texts = [element.text for element in svg.iter(f"{SVG}text")]
     names = {TASK, "demo_checkpoint/checkpoint", "success.mp4", "failure.mp4", "progress", "success", "time (s)"}
-    assert names <= set(texts)
+    assert names <= set(texts(svg))
     lines = [
         [tuple(map(float, point.split(","))) for point in line.attrib["points"].split()]
         for line in svg.iter(f"{SVG}polyline")
@@ -457,14 +450,13 @@ Promise.all(["text", "takeaway", "curves", "figure"].map((name) => import(`/view
 
 def test_modules_cut_names_name_a_reachable_triton_and_lead_a_line_over_skipped_frames(page: Page) -> None:
     """Of seven frames the model skips three, and the score of one is missing."""
-    figure, names, servers = page.browser.driver.execute_async_script(MODULES)
+    markup, names, servers = page.browser.driver.execute_async_script(MODULES)
     assert names == ["rollout_seed…100k.mp4", "success.mp4"]
     assert servers == [["--url", "grpc://127.0.0.1:8001"], [], ["--url", "grpc://triton:8001"]]
-    svg = ElementTree.fromstring(figure)
+    svg = ElementTree.fromstring(markup)
     assert [len(line.attrib["points"].split()) for line in svg.iter(f"{SVG}polyline")] == [2, 1]
-    texts = [element.text for element in svg.iter(f"{SVG}text")]
-    assert "\N{MINUS SIGN}0.5" in texts  # the axis reaches the score below 0
-    assert texts.count("a.mp4") == 1  # a curve alone needs no legend
+    assert "\N{MINUS SIGN}0.5" in texts(svg)  # the axis reaches the score below 0
+    assert texts(svg).count("a.mp4") == 1  # a curve alone needs no legend
 
 
 def test_the_documentation_of_endpoints_needs_no_network(gateway: Gateway, quiet_browser: Browser) -> None:

@@ -17,12 +17,12 @@ from selenium.webdriver import ActionChains, Keys
 from selenium.webdriver.support.select import Select
 
 from browsers import Browser
-from gateways import poll, running
+from gateways import running
 from labelling import BrightnessScorer
 from rfm_client import RewardClient
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset, summarise
 from rfm_labels.datasets import LeRobotDataset
-from servers import Endpoints
+from servers import Endpoints, wait_for
 from shown_datasets import CAMERAS, columns_of, copied, large
 from tolerances import SHOWN, TOLERANCE
 from toy_world import Task
@@ -61,7 +61,7 @@ class Page:
 
     def has(self, link: str) -> None:
         """Wait until the page has this address."""
-        poll(lambda: self.browser.run("return location.hash") == link)
+        wait_for(lambda: self.browser.run("return location.hash") == link)
 
     def show(self) -> None:
         self.browser["dataset-tab"].click()
@@ -108,12 +108,8 @@ class Page:
 
     def move_to(self, time_s: float) -> None:
         """Moves the slider, as a person does, and waits for the videos."""
-        self.browser.run(
-            "const slider = document.getElementById('episode-time'); slider.value = arguments[0]; "
-            "slider.dispatchEvent(new Event('input'))",
-            time_s,
-        )
-        poll(lambda: self.is_at(time_s, 0.02))
+        self.browser.enter("#episode-time", time_s)
+        wait_for(lambda: self.is_at(time_s, 0.02))
         self.browser.until(ARE_THERE)  # a seeking video reports the target and shows the old frame
 
     def is_at(self, time_s: float, abs_s: float) -> bool:
@@ -214,11 +210,7 @@ def test_the_threshold_moves_counts_and_histogram(page: Page) -> None:
     best, voted = summary.best_success, summary.voted_success
     assert best is not None and voted is not None
     for threshold in (0.0, float(np.float32(np.median(best))), 1.0):
-        page.browser.run(
-            "const slider = document.getElementById('cutoff'); slider.value = arguments[0]; "
-            "slider.dispatchEvent(new Event('input'))",
-            threshold,
-        )
+        page.browser.enter("#cutoff", threshold)
         cut = float(page.browser["cutoff"].get_attribute("value"))
         never = int((best < cut).sum())
         assert page.browser["ends-told"].text.startswith(f"{never} of {len(best)} episodes never succeed")
@@ -355,14 +347,14 @@ def test_a_click_plays_the_episode_and_keys_step_through_frames_and_episodes_and
     page.watch(first)
     end_s = (dataset.episodes[first].num_frames - 1) / 10
     seen = [page.browser.times_s(PLAYERS)[-1]]
-    poll(lambda: seen.append(page.browser.times_s(PLAYERS)[-1]) or seen[-1] == pytest.approx(end_s, abs=0.01))  # type: ignore[func-returns-value]
+    wait_for(lambda: seen.append(page.browser.times_s(PLAYERS)[-1]) or seen[-1] == pytest.approx(end_s, abs=0.01))  # type: ignore[func-returns-value]
     assert len(set(seen)) > 2
     assert sorted(seen) == seen
     page.browser.until_text("episode-play", "Play")
     numbers_are_those_of(-1)
     for _ in range(3):
         page.browser["episode-time"].send_keys(Keys.ARROW_LEFT)
-    poll(page.is_at_one_time)
+    wait_for(page.is_at_one_time)
     numbers_are_those_of(round(page.browser.times_s(PLAYERS)[-1] * 10))
     page.browser.run("document.activeElement.blur()")
     press(Keys.SPACE)

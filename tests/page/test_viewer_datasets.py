@@ -203,20 +203,6 @@ def test_an_hdf5_file_that_would_show_another_file_is_refused(
         pass
 
 
-def test_an_hdf5_file_that_changes_to_show_another_file_is_not_read(tmp_path: Path) -> None:
-    file, path = hdf5(tmp_path), "/0/episodes/3/videos/0"
-    other = shutil.copy(file, tmp_path / "other.hdf5")
-    with serving(file) as get:
-        assert get(path).status_code == 200
-        with h5py.File(file, "r+") as opened:
-            del opened["data/demo_3/obs/front"]
-            opened["data/demo_3/obs/front"] = h5py.ExternalLink(str(other), "/data/demo_3/obs/front")
-        assert "expected data in the file, got data in another file" in failure(get(path), 500)
-        file.unlink()
-        os.mkfifo(file)  # opening it would block until a writer comes
-        assert "an HDF5 file, got a folder, a pipe, a socket or a device" in failure(get(path), 500)
-
-
 def check_frames(get: Get, root: Path, episode: int, number: int = 0, camera: int = 0) -> None:
     """The video that is answered has the episode's frames and no other, from 0 s on."""
     response = get(f"/{number}/episodes/{episode}/videos/{camera}")
@@ -284,27 +270,40 @@ def test_a_dataset_with_links_that_leave_it_is_refused(folders: list[Path], tmp_
         pass
 
 
-@pytest.mark.parametrize(("name", "path"), [(VIDEO, "/0/episodes/0/videos/0"), ("rfm_progress.parquet", "/0")])
-def test_a_file_that_becomes_a_link_out_of_the_dataset_is_not_read(
-    folders: list[Path], tmp_path: Path, name: str, path: str
+def linked(file: Path, outside: Path) -> None:
+    file.unlink()
+    file.symlink_to(outside)
+
+
+def piped(file: Path, _outside: Path) -> None:
+    file.unlink()
+    os.mkfifo(file)  # opening it would block until a writer comes
+
+
+def rewired(file: Path, outside: Path) -> None:
+    with h5py.File(file, "r+") as opened:
+        external_link(opened, outside)
+
+
+OF_VIDEO_0, OF_DEMO = "/0/episodes/0/videos/0", "/0/episodes/3/videos/0"
+CHANGES: dict[str, tuple[str, Callable[[Path, Path], None], str, str]] = {  # a file, its change, the path, the message
+    "a link": (VIDEO, linked, OF_VIDEO_0, "expected a file in the dataset's folder, got a link that leaves it"),
+    "a pipe": (VIDEO, piped, OF_VIDEO_0, f"{VIDEO}: expected a file or a folder, got a pipe, a socket or a device"),
+    "HDF5, a link": ("", rewired, OF_DEMO, "expected data in the file, got data in another file"),
+    "HDF5, a pipe": ("", piped, OF_DEMO, "an HDF5 file, got a folder, a pipe, a socket or a device"),
+}
+
+
+@pytest.mark.parametrize(("name", "change", "path", "message"), CHANGES.values(), ids=CHANGES)
+def test_a_dataset_that_changes_to_show_another_file_is_not_read(
+    tmp_path: Path, name: str, change: Callable[[Path, Path], None], path: str, message: str
 ) -> None:
-    root = Path(shutil.copytree(folders[V30], tmp_path / "swapped"))
+    root = copied("toy_v30_many", tmp_path) if name else hdf5(tmp_path)
+    outside = Path(shutil.copy(root / name, tmp_path / "outside"))
     with serving(root) as get:
         assert get(path).status_code == 200
-        (root / name).unlink()
-        (root / name).symlink_to(folders[V30] / name)
-        expected = f"swapped/{name}: expected a file in the dataset's folder, got a link that leaves it"
-        assert failure(get(path), 500).startswith(expected)
-
-
-def test_a_pipe_in_a_dataset_is_not_read(tmp_path: Path) -> None:
-    """Opening it would block until a writer comes."""
-    root = copied("toy_v30_many", tmp_path)
-    with serving(root) as get:
-        (root / VIDEO).unlink()
-        os.mkfifo(root / VIDEO)
-        expected = f"{VIDEO}: expected a file or a folder, got a pipe, a socket or a device"
-        assert failure(get("/0/episodes/0/videos/0"), 500).endswith(expected)
+        change(root / name, outside)
+        assert message in failure(get(path), 500)
 
 
 BROKEN: dict[str, tuple[str, bytes | None, str, str]] = {  # a file, the content, the requested path, the message

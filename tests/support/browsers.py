@@ -17,8 +17,8 @@ from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
 from selenium.webdriver.remote.webelement import WebElement
 
-from gateways import poll
 from rfm_client import UInt8Array
+from servers import wait_for
 
 AXE = Path(__file__).parents[1] / "page" / "vendored" / "axe-core" / "axe.min.js"
 WINDOW_PX = (1280, 1400)
@@ -56,6 +56,11 @@ class Browser:
         self[name].clear()
         self[name].send_keys(text)
 
+    def enter(self, selector: str, value: float | str) -> None:
+        """Give an input, such as a slider, a value, as a person does."""
+        script = "const input = document.querySelector(arguments[0]); input.value = arguments[1]; "
+        self.run(script + "input.dispatchEvent(new Event('input'))", selector, value)
+
     def drop(self, files: Sequence[Path]) -> None:
         """Drops files onto the middle of the page, as a person does with the mouse."""
         data = {"items": [], "files": [str(file) for file in files], "dragOperationsMask": 1}
@@ -72,12 +77,12 @@ class Browser:
             found[:] = [self.run(f"return {script}")]
             return bool(found[0])
 
-        poll(is_there)
+        wait_for(is_there)
         return found[0]
 
     def until_text(self, name: str, text: str) -> None:
         """Waits until the element of this id has this text."""
-        poll(lambda: self[name].text == text)
+        wait_for(lambda: self[name].text == text)
 
     def cells(self, rows: str) -> list[list[str]]:
         """Return the cells' text of the table rows that match a selector."""
@@ -117,7 +122,7 @@ class Browser:
     def saved(self, name: str) -> bytes:
         """A file that the page has just let the browser save."""
         file = self.downloads / name
-        poll(lambda: file.exists() and file.stat().st_size > 0)
+        wait_for(lambda: file.exists() and file.stat().st_size > 0)
         content = file.read_bytes()
         file.unlink()
         return content

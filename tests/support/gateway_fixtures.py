@@ -82,12 +82,12 @@ def quiet_browser(browser: Browser) -> Iterator[Browser]:
     assert [line for line in browser.complaints() if "viewer/score" not in line] == []  # of the files it refuses
 
 
-def gateway_of(model: str, *options: str) -> Any:
+def gateway_of(model: str) -> Any:
     @pytest.fixture(scope="session")
     def gateway(triton: Triton, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
         from gateways import running
 
-        with running(triton.endpoints, tmp_path_factory.mktemp("gateway"), model, *options) as started:
+        with running(triton.endpoints, tmp_path_factory.mktemp("gateway"), model) as started:
             yield started
             assert not started.metric("requests_total", code="500")
 
@@ -95,7 +95,6 @@ def gateway_of(model: str, *options: str) -> Any:
 
 
 tiny, encoders, video = gateway_of(TINY), gateway_of(ENCODERS), gateway_of(VLM)
-strict = gateway_of(TINY, "--timeout", "1", "--max-in-flight", "1", "--max-waiting", "0", "--max-body-mib", "1")
 
 
 @pytest.fixture(params=["json", "npy"])

@@ -211,11 +211,6 @@ def of_frames(frames: Any, **fields: Any) -> Json:
 BLACK = np.zeros((2, 8, 8, 3), np.uint8)
 
 
-def as_parts(path: Sequence[Any]) -> list[Any]:
-    """The path of a sample's field in JSON, as it is in a form."""
-    return [f"sample_{path[1]}", *path[2:]]
-
-
 def check_refused(response: requests.Response, *told: tuple[Sequence[Any], str]) -> None:
     """422 with exactly these fields and reasons."""
     assert response.status_code == 422, response.text

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,7 +28,7 @@ from rfm_client import AsyncRewardClient, DeadlineExceededError, ModelInfo, Mode
 from rfm_gateway import GatewayConfig
 from rfm_gateway.app import create_app
 from rfm_gateway.command import server_options
-from servers import Endpoints
+from servers import PATIENCE_S, Endpoints, wait_for
 from shelves import Shelf
 from transports import Answer, Tensors
 
@@ -36,7 +36,6 @@ with warnings.catch_warnings():  # it would rather have httpx2
     warnings.simplefilter("ignore")
     from starlette.testclient import TestClient as TestClient
 
-WITHIN_S = 60
 NO_TRITON = "grpc://127.0.0.1:1"
 
 
@@ -47,13 +46,13 @@ class Address:
     url: str
 
     def connect(self) -> http.client.HTTPConnection:
-        return http.client.HTTPConnection(self.url.removeprefix("http://"), timeout=WITHIN_S)
+        return http.client.HTTPConnection(self.url.removeprefix("http://"), timeout=PATIENCE_S)
 
     def dial(self) -> socket.socket:
-        return socket.create_connection(("127.0.0.1", int(self.url.rpartition(":")[2])), WITHIN_S)
+        return socket.create_connection(("127.0.0.1", int(self.url.rpartition(":")[2])), PATIENCE_S)
 
     def get(self, path: str, **options: Any) -> requests.Response:
-        return requests.get(f"{self.url}{path}", timeout=WITHIN_S, **options)
+        return requests.get(f"{self.url}{path}", timeout=PATIENCE_S, **options)
 
     def metric(self, name: str, **labels: str) -> float:
         """Return the value of a metric of the gateway."""
@@ -89,13 +88,6 @@ def metric_at(url: str, name: str, **labels: str) -> float:
     return sum(each.value for each in samples if each.name == name and labels.items() <= each.labels.items())
 
 
-def poll(is_so: Callable[[], bool]) -> None:
-    ends_s = time.monotonic() + WITHIN_S
-    while not is_so():
-        assert time.monotonic() < ends_s
-        time.sleep(0.02)
-
-
 def answers(url: str) -> bool:
     try:
         return requests.get(f"{url}/openapi.json").ok
@@ -115,13 +107,13 @@ def running(
         process = subprocess.Popen(command, env={**os.environ, **environment}, stdout=log, stderr=log)
     gateway = Gateway(f"http://127.0.0.1:{port}", model, endpoints.grpc_url, process, log_file)
     try:
-        poll(lambda: process.poll() is not None or answers(gateway.url))
+        wait_for(lambda: process.poll() is not None or answers(gateway.url))
         assert process.poll() is None, gateway.log
         yield gateway
         assert "Traceback" not in gateway.log
     finally:
         process.terminate()
-        process.wait(WITHIN_S)
+        process.wait(PATIENCE_S)
 
 
 @dataclass
@@ -182,9 +174,9 @@ def listening(triton: StandIn, api_key: str | None = None, **settings: Any) -> I
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         try:
-            poll(lambda: server.started)
+            wait_for(lambda: server.started)
             yield Address(f"http://127.0.0.1:{listener.getsockname()[1]}")
         finally:
             triton.is_open.set()
             server.should_exit = True
-            thread.join(WITHIN_S)
+            thread.join(PATIENCE_S)

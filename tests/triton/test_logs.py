@@ -19,7 +19,7 @@ from tritonclient.utils import np_to_triton_dtype
 import goldens
 import rfm_export
 from engines import serve_config
-from gateways import answers, poll
+from gateways import answers
 from paths import ROOT
 from repositories import FAILING, FAILING_STEPS
 from rfm_client import (
@@ -103,7 +103,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         with serving(repository, f"--gateway-port={port}", "--", *options) as served:
             served.wait_ready()
             gateway = f"http://127.0.0.1:{port}"
-            poll(lambda: answers(gateway))
+            wait_for(lambda: answers(gateway))
             yield Running(served, traces, gateway)
 
 

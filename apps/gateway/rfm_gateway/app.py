@@ -27,24 +27,23 @@ from rfm_client import (
     RewardError,
     ServerUnavailableError,
 )
-from rfm_gateway import pages, schema
-from rfm_gateway.admission import RETRY_AFTER, Places
-from rfm_gateway.blank_frames import WARNING_HEADER
+from rfm_gateway import schema
+from rfm_gateway.access import ForeignPageMiddleware, key_check
 from rfm_gateway.body import Batch, BodyLimits, read_json, read_multipart
 from rfm_gateway.config import MIB, GatewayConfig
-from rfm_gateway.foreign_pages import ForeignPageMiddleware
-from rfm_gateway.keys import key_check
-from rfm_gateway.mounting import PageHost, page_of
+from rfm_gateway.mounting import PageHost, add_docs, page_of
 from rfm_gateway.observe import (
     CALLER_LEFT,
     REQUEST_ID_HEADER,
+    RETRY_AFTER,
     CallerLeftError,
     GatewayMetrics,
+    Places,
     RequestMiddleware,
     while_connected,
 )
-from rfm_gateway.refusals import LingerMiddleware, Refusals, asked
-from rfm_gateway.scoring import Evaluator
+from rfm_gateway.refusals import LingerMiddleware, asked, refuse
+from rfm_gateway.scoring import WARNING_HEADER, Evaluator
 from rfm_gateway.state import ServedParts, TritonState, message_of
 
 _REFERENCE = "#/components/schemas/{model}"
@@ -78,7 +77,7 @@ def create_app(
     folder = config.resolved_folder
     client, metrics = client or config.client(), GatewayMetrics()
     limits = BodyLimits(config.max_body_mib * MIB, config.timeout_s)
-    parts, refusals = ServedParts(), Refusals()
+    parts = ServedParts()
     state = TritonState(client, config, parts)
 
     @asynccontextmanager
@@ -93,10 +92,9 @@ def create_app(
         lifespan=lifespan,
         docs_url=None,
         redoc_url=None,
-        exception_handlers=_handlers(refusals),
+        exception_handlers=_handlers(),
     )
-    has_key = api_key is not None
-    app.add_middleware(ForeignPageMiddleware, config=config, refusals=refusals, has_key=has_key)  # the innermost
+    app.add_middleware(ForeignPageMiddleware, config=config, has_key=api_key is not None)  # the innermost
     app.add_middleware(RequestMiddleware, metrics=metrics)
     if config.cors_origin:
         app.add_middleware(
@@ -109,9 +107,7 @@ def create_app(
     app.add_middleware(LingerMiddleware)  # the outermost: the answer is counted before
     guards = [] if api_key is None else [Depends(key_check(api_key))]
     guarded = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
-    evaluator = Evaluator(
-        client, limits, parts, folder, use_frame_steps=config.use_frame_steps, refuse_blank=config.refuse_blank
-    )
+    evaluator = Evaluator(client, limits, parts, folder, config.use_frame_steps, config.refuse_blank)
     place = Depends(Places(config, metrics).taken)
     _add_evaluations(guarded, limits, evaluator, metrics, place)
     _add_reports(guarded, state, metrics)
@@ -122,7 +118,7 @@ def create_app(
         """Healthy if every model answers a probe or is busy."""
         return await state.health()
 
-    pages.add_docs(app)
+    add_docs(app)
     add_page = page_of(config)
     if add_page is not None:
         add_page(PageHost(app, guards, place, config, limits, metrics, started_by))
@@ -205,24 +201,24 @@ def _failures(*codes: int) -> dict[int | str, dict[str, Any]]:
     return {code: {"model": schema.Failure} for code in codes}
 
 
-def _handlers(refusals: Refusals) -> dict[Any, Any]:
+def _handlers() -> dict[Any, Any]:
     """Return handlers that answer every error as JSON, and never answer bad input with 500."""
 
     def fixed(code: int, detail: str, **headers: str) -> Callable[..., Awaitable[JSONResponse]]:
         async def handler(request: Request, _error: Exception) -> JSONResponse:
-            return refusals.answer(request.scope, code, detail, headers)
+            return refuse(request.scope, code, detail, headers)
 
         return handler
 
     async def refused(request: Request, error: HTTPException) -> JSONResponse:
-        return refusals.answer(request.scope, error.status_code, error.detail, error.headers)
+        return refuse(request.scope, error.status_code, error.detail, error.headers)
 
     async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
-        return refusals.answer(request.scope, 422, jsonable_encoder(error.errors()))
+        return refuse(request.scope, 422, jsonable_encoder(error.errors()))
 
     async def failed(request: Request, error: RewardError) -> JSONResponse:
         code = next((code for kind, code in _STATUS_OF.items() if isinstance(error, kind)), 500)
-        return refusals.answer(request.scope, code, message_of(error), RETRY_AFTER if code == 503 else None)
+        return refuse(request.scope, code, message_of(error), RETRY_AFTER if code == 503 else None)
 
     async def unexpected(request: Request, error: Exception) -> JSONResponse:
         logger.error("500 %s: unexpected", asked(request.scope), exc_info=error)

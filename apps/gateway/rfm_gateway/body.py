@@ -33,8 +33,7 @@ IN_MEMORY_BYTES = 32 * 2**20  # of a file; larger files lie on disk
 MAX_SAMPLES = 10_000  # of one request
 MAX_JSON_BYTES = 32 * 2**20  # large arrays come as files
 AS_FILES = "send arrays as .npy files, to /evaluate_batch_npy"
-LESS = "send less in one request"
-LARGER = f"{LESS}, or start the gateway with --max-body-mib (rfm serve: --gateway-max-body-mib)"
+LARGER = "send less in one request, or start the gateway with --max-body-mib (rfm serve: --gateway-max-body-mib)"
 
 _format: Any = np.lib.format  # numpy declares no types for it
 _BROKEN_NPY = (ValueError, TypeError, LookupError, SyntaxError, TokenError, MemoryError, RecursionError)  # its errors
@@ -72,10 +71,9 @@ class BodyLimits:
     max_bytes: int
     timeout_s: float
 
-    async def read(self, request: Request, max_bytes: int = MAX_JSON_BYTES) -> bytes:
+    async def read_json(self, request: Request) -> bytes:
         """Return the whole body."""
-        remedy = AS_FILES if max_bytes == MAX_JSON_BYTES else LESS
-        limit = (self.max_bytes, LARGER) if self.max_bytes <= max_bytes else (max_bytes, remedy)
+        limit = min((self.max_bytes, LARGER), (MAX_JSON_BYTES, AS_FILES))
         with anyio.fail_after(self.timeout_s):
             return b"".join([chunk async for chunk in self._chunks(request, *limit)])
 
@@ -168,7 +166,7 @@ class _Form(MultiPartParser):
 
 async def read_json(limits: BodyLimits, request: Request) -> Batch:
     """Return the samples of a JSON request. Raises RequestValidationError and the errors of ``limits``."""
-    body = await limits.read(request)
+    body = await limits.read_json(request)
     return await off_loop(len(body), _of_json, body)
 
 

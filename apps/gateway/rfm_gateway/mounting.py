@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The page in the browser, which another package brings: how the gateway finds it, and what it offers to it.
+"""Pages in the browser: Swagger UI, and the page that another package brings.
 
-The package's entry point in the group ``rfm_gateway.page`` names an ``AddPage``.
+Their files are installed, so they need no network. The other package's entry point in the group ``rfm_gateway.page``
+names an ``AddPage``.
 """
 
 from __future__ import annotations
@@ -10,21 +11,64 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
-from fastapi import APIRouter, FastAPI
+from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.params import Depends
+from starlette.staticfiles import StaticFiles
 
 from rfm_client.options import ConfigError
 from rfm_gateway.body import BodyLimits
 from rfm_gateway.config import GatewayConfig
 from rfm_gateway.field_errors import field_errors, invalid
 from rfm_gateway.observe import GatewayMetrics, while_connected
-from rfm_gateway.pages import add_page
 
 __all__ = ["BodyLimits", "GatewayConfig", "PageHost", "field_errors", "invalid", "while_connected"]
 
 INSTALL = "pip install ./client ./apps/gateway ./apps/page"
+_PACKAGE = Path(__file__).parent
+_POLICY = (  # nothing from other hosts, no inline scripts or styles
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; media-src 'self' blob:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_HEADERS = {
+    "Content-Security-Policy": _POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-cache",  # browsers ask again, and get 304 for an unchanged file
+}
+
+
+class _Files(StaticFiles):
+    """The files of a folder, with the headers of a page."""
+
+    def file_response(self, *arguments: Any, **options: Any) -> Response:
+        response = super().file_response(*arguments, **options)
+        response.headers.update(_HEADERS)
+        return response
+
+
+def add_docs(app: FastAPI) -> None:
+    """Add Swagger UI at ``/docs``, and its files."""
+    _add_files(app, "/docs", "/docs", _PACKAGE / "docs", **{"swagger-ui": _PACKAGE / "vendored" / "swagger-ui"})
+
+
+def _add_files(app: FastAPI, page: str, path: str, folder: Path, **folders: Path) -> None:
+    """Add a page whose ``index.html`` is in ``folder``.
+
+    page: path of the page
+    path: of its files
+    folders: more of its files, by the name below ``path``
+    """
+    files = _Files(directory=folder)
+
+    @app.api_route(page, methods=["GET", "HEAD"], include_in_schema=False)
+    async def index(request: Request) -> Response:
+        return await files.get_response("index.html", request.scope)
+
+    for name, each in folders.items():
+        app.mount(f"{path}/{name}", _Files(directory=each))
+    app.mount(path, files)
 
 
 @dataclass(frozen=True)
@@ -53,7 +97,7 @@ class PageHost:
 
         folders: more files, by the name below ``/viewer``
         """
-        add_page(self.app, "/", "/viewer", folder, **folders)
+        _add_files(self.app, "/", "/viewer", folder, **folders)
 
 
 AddPage: TypeAlias = Callable[[PageHost], None]  # adds a page; raises ConfigError for settings that it cannot serve

@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""Count requests for Prometheus, and cancel work that is late, or whose caller has hung up."""
+"""Count requests for Prometheus, bound those at a time, and cancel work that is late or whose caller has hung up."""
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Coroutine
+from collections.abc import AsyncGenerator, Coroutine
 from typing import Any, TypeVar
 
-from fastapi import Request
+import anyio
+from fastapi import HTTPException, Request
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rfm_client import DeadlineExceededError
 from rfm_client.serving import begin_request
+from rfm_gateway.config import GatewayConfig
 
 Returned = TypeVar("Returned")
 
@@ -35,6 +37,7 @@ REJECTIONS = {
 }
 
 REQUEST_ID_HEADER = "X-Request-ID"
+RETRY_AFTER = {"Retry-After": "1"}
 
 _BUCKETS_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0)
 
@@ -74,6 +77,34 @@ class GatewayMetrics:
     def text(self) -> bytes:
         """Return the metrics in the text format of Prometheus."""
         return generate_latest(self._registry)
+
+
+class Places:
+    """Places for evaluations: ``max_in_flight`` at a time; ``max_waiting`` more wait, first come, first served."""
+
+    def __init__(self, config: GatewayConfig, metrics: GatewayMetrics) -> None:
+        self._config = config
+        self._places = anyio.CapacityLimiter(config.max_in_flight)
+        metrics.in_flight.set_function(lambda: self._places.borrowed_tokens)
+        metrics.waiting.set_function(lambda: self._places.statistics().tasks_waiting)
+
+    async def taken(self) -> AsyncGenerator[None, None]:
+        """Dependency of endpoints: take a place before the body is read, and give it back after the answer.
+
+        Raises HTTPException 503 if too many wait, or no place is free within ``timeout_s``.
+        """
+        detail = f"expected at most {self._config.max_in_flight} evaluations at a time, got more"
+        full, places, request = HTTPException(503, detail, RETRY_AFTER), self._places, object()
+        if places.available_tokens < 1 and places.statistics().tasks_waiting >= self._config.max_waiting:
+            raise full
+        with anyio.move_on_after(self._config.timeout_s) as waiting:
+            await places.acquire_on_behalf_of(request)
+        if waiting.cancelled_caught:
+            raise full
+        try:
+            yield
+        finally:
+            places.release_on_behalf_of(request)
 
 
 class RequestMiddleware:

@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import anyio
@@ -14,51 +13,19 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LINGER_S = 10.0  # as aiohttp
-PERIOD_S = 10.0
-MOST_LINES = 20  # in PERIOD_S
 _MOST_LETTERS = 500  # of a reason
 _MOST_NAME_LETTERS = 100  # of a path or a program
 
 logger = logging.getLogger("rfm_gateway.refusals")
 
 
-class LimitedLog:
-    """Writes at most ``most_lines`` warnings in PERIOD_S. The first line after that tells the number of the others.
+def refuse(scope: Scope, code: int, detail: Any, headers: Mapping[str, str] | None = None) -> JSONResponse:
+    """Write a line to the log, and return the answer with this status, 400 or above.
 
-    others: follows that number, such as ``more requests were refused``
+    detail: text, or errors at fields as ``field_errors.invalid`` makes them
     """
-
-    def __init__(
-        self, logger: logging.Logger, most_lines: int, others: str, clock_s: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._logger, self._most_lines, self._others, self._clock_s = logger, most_lines, others, clock_s
-        self._began_s = float("-inf")  # the period
-        self._num_lines = self._num_left_out = 0
-
-    def write(self, line: str) -> None:
-        """Write a line, or count it."""
-        now_s = self._clock_s()
-        if now_s - self._began_s >= PERIOD_S:
-            if self._num_left_out:
-                self._logger.warning("%d %s", self._num_left_out, self._others)
-            self._began_s, self._num_lines, self._num_left_out = now_s, 0, 0
-        if self._num_lines == self._most_lines:
-            self._num_left_out += 1
-            return
-        self._num_lines += 1
-        self._logger.warning("%s", line)
-
-
-class Refusals:
-    """Answers of status 400 and above. Each is a line in the log, within the limits of LimitedLog."""
-
-    def __init__(self) -> None:
-        self._log = LimitedLog(logger, MOST_LINES, "more requests were refused or failed")
-
-    def answer(self, scope: Scope, code: int, detail: Any, headers: Mapping[str, str] | None = None) -> JSONResponse:
-        """Return the answer. detail: text, or errors at fields as ``field_errors.invalid`` makes them"""
-        self._log.write(f"{code} {asked(scope)}: {_reason(detail)}")
-        return JSONResponse({"detail": detail}, code, headers)
+    logger.warning("%d %s: %s", code, asked(scope), _reason(detail))
+    return JSONResponse({"detail": detail}, code, headers)
 
 
 class LingerMiddleware:

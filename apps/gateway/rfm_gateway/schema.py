@@ -154,10 +154,7 @@ def _check_axes(frames: np.ndarray[Any, Any]) -> None:
     shape, channels = frames.shape, (RGB_CHANNELS, RGBA_CHANNELS)
     if frames.dtype.kind != "b" and frames.ndim in (3, MAX_AXES) and shape[-1] in channels and 0 not in shape:
         return
-    axes = "0, 2, 3, 1" if frames.ndim == MAX_AXES else "1, 2, 0"
-    is_planar = frames.ndim in (3, MAX_AXES) and shape[-3] in channels
-    remedy = f"the channels come last: transpose the axes to ({axes})" if is_planar else ""
-    raise InvalidSampleError.at("frames", "uint8 [T, H, W, 3]", f"{frames.dtype} {list(shape)}", remedy)
+    raise InvalidSampleError.at("frames", "uint8 [T, H, W, 3]", f"{frames.dtype} {list(shape)}")
 
 
 class _Sample(BaseModel):

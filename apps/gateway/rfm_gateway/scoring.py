@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice
@@ -30,28 +29,31 @@ from rfm_client import (
     SimilarityResult,
     SimilaritySample,
     Trajectory,
+    UInt8Array,
 )
+from rfm_client.frames import BlankFrames
+from rfm_client.options import first_names
 from rfm_client.serving import off_loop
 from rfm_gateway import schema
-from rfm_gateway.blank_frames import refuse_blank_frames, warning_of
 from rfm_gateway.body import Batch, BodyLimits
 from rfm_gateway.field_errors import refused
 from rfm_gateway.folder import RequestFiles
 from rfm_gateway.observe import within
-from rfm_gateway.refusals import LimitedLog
 from rfm_gateway.state import ServedParts
 
 FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
 FRAME_STEPS_OF_SECONDS = 8  # the same, for a model of remaining seconds
 PREFERRED = 0.5
 CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the chosen trajectory is first, and better
+WARNING_HEADER = "X-RFM-Warning"  # of answers whose scores mean nothing
+PADDING = "frames of zeros at the end (send the real frames alone, without padding)"
+MOST_NAMES = 12  # samples that a warning names
 _BLANK = np.zeros((1, 32, 32, 3), np.uint8)  # sent with a task to get only the embedding of the task
-
-logger = logging.getLogger("rfm_gateway")
 
 Text: TypeAlias = Float32Array | InvalidSampleError  # the embedding of a task, or the encoder's error
 
 
+@dataclass(frozen=True)
 class Evaluator:
     """Scores batches with the server behind ``client``.
 
@@ -61,23 +63,12 @@ class Evaluator:
     refuse_blank: True: black and single-colour frames are invalid
     """
 
-    def __init__(
-        self,
-        client: AsyncRewardClient,
-        limits: BodyLimits,
-        parts: ServedParts,
-        folder: Path | None = None,
-        *,
-        use_frame_steps: bool = False,
-        refuse_blank: bool = False,
-    ) -> None:
-        self._client = client
-        self._limits = limits
-        self._parts = parts
-        self._folder = folder
-        self._use_frame_steps = use_frame_steps
-        self._refuse_blank = refuse_blank
-        self._warnings = LimitedLog(logger, 1, "more requests had such samples")
+    client: AsyncRewardClient
+    limits: BodyLimits
+    parts: ServedParts
+    folder: Path | None
+    use_frame_steps: bool
+    refuse_blank: bool
 
     async def evaluate(self, batch: Batch, request_id: str) -> tuple[schema.EvaluateBatchAnswer, str]:
         """Return the answer to a whole batch, and a warning of samples that show nothing; empty: there are none.
@@ -87,10 +78,10 @@ class Evaluator:
         Raises RequestValidationError that lists all invalid samples, HTTPException for files that are too large, and
         ServerError.
         """
-        with self._limits.decoding() as take:
-            scoring = self._evaluate(batch, RequestFiles(self._folder, take), request_id)
+        with self.limits.decoding() as take:
+            scoring = self._evaluate(batch, RequestFiles(self.folder, take), request_id)
             try:
-                return await within(self._limits.timeout_s, scoring)
+                return await within(self.limits.timeout_s, scoring)
             except Exception as error:
                 clear_frames(error.__traceback__)  # otherwise errors among their variables keep the arrays in memory
                 raise
@@ -100,24 +91,22 @@ class Evaluator:
     ) -> tuple[schema.EvaluateBatchAnswer, str]:
         embeddings, frames = await self._served(batch.samples)
         texts = await self._texts(batch.samples, request_id) if embeddings is not None else {}
-        use_frame_steps = self._use_frame_steps if batch.use_frame_steps is None else batch.use_frame_steps
+        use_frame_steps = self.use_frame_steps if batch.use_frame_steps is None else batch.use_frame_steps
         by_prefix = use_frame_steps and frames is not None and frames.scores_whole_prefixes
         frame_steps = _frame_steps(frames) if use_frame_steps and not by_prefix else 0
-        conversion = _Conversion(embeddings, frames, texts, files, frame_steps, self._refuse_blank)
-        num_bytes = batch.num_bytes if self._folder is None else None  # files may be large
+        conversion = _Conversion(embeddings, frames, texts, files, frame_steps, self.refuse_blank)
+        num_bytes = batch.num_bytes if self.folder is None else None  # files may be large
         samples, warning = await off_loop(num_bytes, conversion.samples, batch)
-        if warning:
-            self._warnings.write(warning)
         asked = [_prefixes(sample) if by_prefix else [sample] for sample in samples]
         flat = chain.from_iterable(asked)
-        outcomes = iter(await self._client.evaluate(flat, return_errors=True, request_id=request_id))
+        outcomes = iter(await self.client.evaluate(flat, return_errors=True, request_id=request_id))
         results = _results([list(islice(outcomes, len(of_sample))) for of_sample in asked], batch)
         group = 1 if frames is None or use_frame_steps else await self._frames_per_value(results)
         return _answer(batch.samples, results, group), warning
 
     async def _frames_per_value(self, results: Sequence[Result]) -> int:
         """Return how many frames share a value. Raises ServerUnavailableError while another version is loaded."""
-        info = await self._client.model_info(frames=True)
+        info = await self.client.model_info(frames=True)
         unknown = {str(result.model_version) for result in results} - set(info.versions)
         if info.versions and unknown:
             fault = f"model_version: expected one of {', '.join(info.versions)}, got {', '.join(sorted(unknown))}"
@@ -137,12 +126,12 @@ class Evaluator:
         needs_frames = has_frames and not (embeddings is not None and all(embedded))
         frames = await self._model_info(frames=True) if needs_frames else None
         if embeddings is None and frames is None:  # raises ModelNotFoundError if the other model is missing, too
-            await self._client.model_info(frames=not needs_frames)
+            await self.client.model_info(frames=not needs_frames)
         return embeddings, frames
 
     async def _model_info(self, *, frames: bool) -> ModelInfo | None:
-        with self._parts.asking("frames" if frames else "embeddings"):
-            return await self._client.model_info(frames=frames)
+        with self.parts.asking("frames" if frames else "embeddings"):
+            return await self.client.model_info(frames=frames)
         return None
 
     async def _texts(self, samples: Sequence[schema.Sample], request_id: str) -> Mapping[str, Text]:
@@ -152,14 +141,14 @@ class Evaluator:
         tasks = {task for task in unread if task and task.strip()}
         texts: dict[str, Text] = {}
         if tasks:
-            with self._parts.asking("encoder"):
+            with self.parts.asking("encoder"):
                 found = await asyncio.gather(*(self._text(task, request_id) for task in tasks))
                 texts = dict(zip(tasks, found, strict=True))
         return texts
 
     async def _text(self, task: str, request_id: str) -> Text:
         try:
-            encoded = await self._client.encode(Trajectory(frames=_BLANK, task=task), request_id=request_id)
+            encoded = await self.client.encode(Trajectory(frames=_BLANK, task=task), request_id=request_id)
         except InvalidSampleError as error:  # of this task alone
             return error
         assert encoded.text_embedding is not None
@@ -325,3 +314,32 @@ def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: 
             metadata=[{} if reference.metadata is None else reference.metadata for reference in references],
         )
     return answer
+
+
+def warning_of(samples: Sequence[Sample]) -> str:
+    """Return a warning that names the samples with blank frames, or with zeros at the end; empty if there are none."""
+    shown = [(index, t.frames) for index, sample in enumerate(samples) for t in sample.trajectories if t is not None]
+    clips = [(index, frames, BlankFrames(frames)) for index, frames in shown if frames is not None]
+    blank = {index: found for index, _, found in clips if found.told}
+    padded = dict.fromkeys(index for index, frames, found in clips if not found.told and _is_padded(frames))
+    warnings = []
+    if blank:
+        told = max(blank.values(), key=lambda found: found.highest or 0).told
+        warnings.append(f"samples {first_names(blank, MOST_NAMES)}: {told}: their scores mean nothing")
+    if padded:
+        warnings.append(f"samples {first_names(padded, MOST_NAMES)}: {PADDING}: they are scored as pictures")
+    return "; ".join(warnings)
+
+
+def refuse_blank_frames(trajectory: Trajectory) -> None:
+    """Raise InvalidSampleError for blank frames, and for frames of zeros at the end."""
+    if trajectory.frames is None:
+        return
+    told = BlankFrames(trajectory.frames).told or PADDING * _is_padded(trajectory.frames)
+    if told:
+        raise InvalidSampleError.at("frames", "pictures that show something", told)
+
+
+def _is_padded(frames: UInt8Array) -> bool:
+    """True if zeros follow a picture, up to the last frame."""
+    return not frames[-1].any() and bool(frames.any())

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 
 from rfm_client import (
     AccessDeniedError,
@@ -24,8 +24,7 @@ from rfm_gateway.config import GatewayConfig
 from rfm_gateway.observe import within
 
 HEALTH_TIMEOUT_S = 3.5  # of all probes; with HEALTH_KEPT_S less than the promised 5 s
-PROBE_TIMEOUT_S = 1.5  # of one probe; a slower model may be busy
-STALL_S = 30.0  # a model with late probes that finishes no request for so long is not healthy
+PROBE_TIMEOUT_S = 1.5  # of one probe; a slower model counts as busy
 HEALTH_KEPT_S = 1.0  # an answer is kept, since requests without a key must not load the models
 STATUS_TIMEOUT_S = 5.0
 MS_PER_S = 1e3
@@ -69,27 +68,15 @@ class ServedParts:
 
 
 class TritonState:
-    """The state of the client's checkpoint.
+    """The state of the client's checkpoint. parts: that must be served for ``/health``"""
 
-    parts: that must be served for ``/health``
-    clock_s: returns the time in seconds
-    """
-
-    def __init__(
-        self,
-        client: AsyncRewardClient,
-        config: GatewayConfig,
-        parts: ServedParts,
-        clock_s: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, client: AsyncRewardClient, config: GatewayConfig, parts: ServedParts) -> None:
         self._client = client
         self._config = config
         self._parts = parts
-        self._clock_s = clock_s
         self._refreshing = asyncio.Lock()
         self._refreshed_s = float("-inf")
         self._health: schema.Health | str = ""  # a text: the fault
-        self._late: dict[str, tuple[int, float]] = {}  # by model: finished requests, and the time of the last change
 
     async def gpu_status(self) -> schema.GpuStatus:
         """Return the answer of ``/gpu_status``. Raises ServerError."""
@@ -98,12 +85,12 @@ class TritonState:
     async def health(self) -> schema.Health:
         """Return the answer of ``/health`` within HEALTH_TIMEOUT_S.
 
-        Raises ServerUnavailableError if a model neither answers nor is busy.
+        Raises ServerUnavailableError if a model fails a probe.
         """
         async with self._refreshing:
-            if self._clock_s() - self._refreshed_s >= HEALTH_KEPT_S:
+            if time.monotonic() - self._refreshed_s >= HEALTH_KEPT_S:
                 self._health = await self._probe_all()
-                self._refreshed_s = self._clock_s()
+                self._refreshed_s = time.monotonic()
             found = self._health
         if isinstance(found, str):
             raise ServerUnavailableError(found)
@@ -149,14 +136,12 @@ class TritonState:
         return infos or [await self._client.model_info(frames=True)]
 
     async def _probe_all(self) -> schema.Health | str:
-        """Probe every model. Returns a text with the reason if a model neither answers nor is busy."""
+        """Probe every model. Returns a text with the reason if a model fails a probe."""
         ends_s = time.monotonic() + HEALTH_TIMEOUT_S
         try:
-            stall = await within(HEALTH_TIMEOUT_S, self._stall())
+            await within(HEALTH_TIMEOUT_S, self._probe_models())
         except RewardError as error:
             return message_of(error)
-        if stall is not None:
-            return stall
         devices = await self._devices(ends_s - time.monotonic())
         return schema.Health(
             status="healthy",
@@ -164,29 +149,13 @@ class TritonState:
             total_gpus=None if devices is None else devices.total_gpus,
         )
 
-    async def _late_name(self, info: ModelInfo) -> str | None:
-        """Probe a model; return its name if the answer is late. Raises RewardError."""
-        try:
+    async def _probe(self, info: ModelInfo) -> None:
+        """Probe a model. A late answer is no fault: the model may be busy. Raises RewardError."""
+        with suppress(DeadlineExceededError):
             await self._client.probe(info, timeout_s=PROBE_TIMEOUT_S)
-        except DeadlineExceededError:
-            return info.name
-        return None
 
-    async def _stall(self) -> str | None:
-        """Return why models with late answers count as failed; None: they may be busy. Raises RewardError."""
-        names = await asyncio.gather(*map(self._late_name, await self._infos()))
-        late = [name for name in names if name is not None]
-        status = await self._config.status(HEALTH_TIMEOUT_S) if late else None
-        now_s, known, self._late = self._clock_s(), self._late, {}
-        for name in late:
-            assert status is not None
-            finished = sum(e.requests_succeeded + e.requests_failed for e in status.models if e.name == name)
-            num_known, since_s = known.get(name, (finished, now_s))
-            self._late[name] = (finished, since_s if num_known == finished else now_s)
-        for name, (_, since_s) in self._late.items():
-            if now_s - since_s >= STALL_S:
-                return f"{name}: no answer within {PROBE_TIMEOUT_S:g} s, and nothing finished for {STALL_S:g} s"
-        return None
+    async def _probe_models(self) -> None:
+        await asyncio.gather(*map(self._probe, await self._infos()))
 
     def _gpu_status(self, status: ServerStatus) -> schema.GpuStatus:
         names, served = self._client.model_names, {name for device in status.devices for name in device.work}

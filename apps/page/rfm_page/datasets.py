@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""LeRobot datasets for the page, in folders that the operator names, with or without labels. Needs pyarrow.
+"""LeRobot and HDF5 datasets for the page, with or without labels. Needs pyarrow, and h5py for HDF5.
 
 T frames of an episode.
 """
@@ -9,6 +9,8 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import av
@@ -16,11 +18,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.frames import FrameFileError, Video
-from rfm_labels import DatasetEpisode
-from rfm_labels.datasets import LeRobotDataset, Span
-from rfm_page.encoded import encoded
-from rfm_page.links import check_links, links_in
-from rfm_page.shown import ShownDataset
+from rfm_labels import DatasetEpisode, DatasetError, find_label_files
+from rfm_labels.datasets import Hdf5Dataset, LeRobotDataset, Span, opened_hdf5
+from rfm_page.shown import ShownDataset, check_links
+
+_FILES_KNOWN = 64  # HDF5 files whose last check is remembered
 
 
 @dataclass(frozen=True)
@@ -33,10 +35,6 @@ class ShownLeRobot(ShownDataset):
     def has_stored_pixels(self) -> bool:
         """True if all cameras have videos."""
         return not self.dataset.info.images
-
-    def check(self) -> None:
-        """Raise DatasetError for a link out of the folder."""
-        check_links(self.root, links_in(self.root))
 
     @property
     def cameras(self) -> Sequence[str]:
@@ -56,7 +54,7 @@ class ShownLeRobot(ShownDataset):
     def mp4(self, episode: DatasetEpisode, camera: str, take: Callable[[int], object]) -> bytes:
         """Return the episode's part of the stored video, or its pictures as a video. Raises DatasetError."""
         if camera not in self.dataset.info.videos:
-            return encoded(self.dataset.stored_frames(episode, camera), self.fps, take)
+            return super().mp4(episode, camera, take)
         return _cut(self.dataset.span(episode, camera), take)
 
 
@@ -114,3 +112,60 @@ def _packets(video: Any, stream: Any, span: Span, take: Callable[[int], object])
             f"an episode that can be cut out of its video ({remedy})", "one that needs frames behind its end"
         )
     return packets
+
+
+@dataclass(frozen=True)
+class ShownHdf5(ShownDataset):
+    """An HDF5 dataset for the page.
+
+    A file with links to other files, or with data in them, is refused, since its author could show files of this
+    machine.
+    """
+
+    dataset: Hdf5Dataset
+
+    @property
+    def path(self) -> Path:
+        """The file of the dataset."""
+        return self.dataset.file
+
+    def check(self) -> None:
+        """Raise DatasetError for data in other files, in the dataset or its labels."""
+        check_links(self.root, [self.path, *find_label_files(self.path)])
+        _check_inside(self.path, _changed_ns(self.path))
+
+    @property
+    def cameras(self) -> Sequence[str]:
+        """The cameras that are labelled without a choice."""
+        return self.dataset.chosen_cameras()
+
+    @property
+    def fps(self) -> float:
+        """Frames a second: robosuite's control frequency, else its default."""
+        return self.dataset.fps
+
+
+def _changed_ns(file: Path) -> int:
+    """The time of a file's last change, which its author cannot set. Raises DatasetError."""
+    try:
+        return file.stat().st_ctime_ns
+    except OSError as error:
+        raise DatasetError.at(file, "an HDF5 file", error.strerror) from error
+
+
+@lru_cache(_FILES_KNOWN)
+def _check_inside(file: Path, _changed_ns: int) -> None:
+    """Raise DatasetError for data in another file."""
+    import h5py
+
+    def leaves(name: str, link: Any) -> str | None:
+        if isinstance(link, h5py.ExternalLink):
+            return name
+        found = opened.get(name) if isinstance(link, h5py.HardLink) else None
+        is_outside = isinstance(found, h5py.Dataset) and (found.external or found.is_virtual)
+        return name if is_outside else None
+
+    with opened_hdf5(file) as opened:
+        name = opened.visititems_links(leaves)
+    if name is not None:
+        raise DatasetError.at(f"{file}: {name}", "data in the file", "data in another file: copy them into it")

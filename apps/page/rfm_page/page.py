@@ -1,20 +1,31 @@
 # SPDX-License-Identifier: MIT
-"""Add the page to the gateway that serves it: entry point ``rfm_gateway.page``."""
+"""Add the page to the gateway that serves it: entry point ``rfm_gateway.page``.
+
+A request about a dataset names it, an episode and a camera by number, and labels by a name from an earlier answer.
+"""
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import anyio
+from fastapi import APIRouter, HTTPException, Request, Response
+from pydantic_core import to_json
 
 from rfm_client.options import ConfigError
-from rfm_gateway.mounting import GatewayConfig, PageHost
-from rfm_page.dataset_routes import dataset_routes
+from rfm_gateway.mounting import BodyLimits, GatewayConfig, PageHost, while_connected
 from rfm_page.routes import viewer_routes
 
 if TYPE_CHECKING:
     from rfm_page.shown import ShownDataset
 
+Read = TypeVar("Read")
+
 _PACKAGE = Path(__file__).parent
+_HEADERS = {"Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff"}
 
 
 def add_page(host: PageHost) -> None:
@@ -34,9 +45,8 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
 
         from rfm_labels import DatasetError
         from rfm_labels.datasets import Hdf5Dataset, LeRobotDataset, open_to_show
-        from rfm_page.datasets import ShownLeRobot
-        from rfm_page.hdf5_datasets import ShownHdf5
-        from rfm_page.rlds_datasets import ShownRlds
+        from rfm_page.datasets import ShownHdf5, ShownLeRobot
+        from rfm_page.shown import ShownDataset
     except ModuleNotFoundError as error:
         expected = f"the package {error.name}, which reads it"
         raise ConfigError.at("dataset", expected, "none: pip install ./apps/labels") from None
@@ -44,13 +54,60 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
     try:
         for path in config.dataset:
             dataset = open_to_show(path)
-            if isinstance(dataset, LeRobotDataset):
-                datasets.append(ShownLeRobot(dataset))
-            elif isinstance(dataset, Hdf5Dataset):
-                datasets.append(ShownHdf5(dataset))
-            else:
-                datasets.append(ShownRlds(dataset))
+            kind = {LeRobotDataset: ShownLeRobot, Hdf5Dataset: ShownHdf5}.get(type(dataset), ShownDataset)
+            datasets.append(kind(dataset))
             datasets[-1].check()
     except (DatasetError, ImportError) as error:
         raise ConfigError(str(error), "dataset") from None
     return datasets
+
+
+def dataset_routes(datasets: Sequence[ShownDataset], limits: BodyLimits) -> APIRouter:
+    """Return the endpoints of the page's datasets. The evaluation server has no such endpoints."""
+    router = APIRouter(include_in_schema=False)
+
+    async def read(request: Request, number: int, reading: Callable[[ShownDataset], Read]) -> Read:
+        """Check a dataset and read from it, in a thread, and return the result.
+
+        Raises HTTPException 404 for a missing part, 500 for a broken dataset, 504 if reading takes too long.
+        """
+        if not 0 <= number < len(datasets):
+            raise HTTPException(404, f"dataset: expected one of {len(datasets)}, got {number}")
+        with anyio.move_on_after(limits.timeout_s):
+            return await while_connected(request, asyncio.to_thread(datasets[number].read, reading))
+        raise HTTPException(504, f"dataset: expected an answer within {limits.timeout_s:g} s, got none")
+
+    @router.get("/viewer/datasets")
+    async def names() -> Response:
+        about = await asyncio.to_thread(lambda: [each.about for each in datasets])
+        return _json({"datasets": about})
+
+    @router.get("/viewer/datasets/{dataset}")
+    async def table(request: Request, dataset: int, labels: str | None = None) -> Response:
+        return _json(await read(request, dataset, lambda shown: shown.table(labels)))
+
+    @router.get("/viewer/datasets/{dataset}/faults")
+    async def faults(request: Request, dataset: int) -> Response:
+        return _json(await read(request, dataset, lambda shown: shown.faults()))
+
+    @router.get("/viewer/datasets/{dataset}/episodes/{episode}")
+    async def curves(request: Request, dataset: int, episode: int, labels: str | None = None) -> Response:
+        return _json(await read(request, dataset, lambda shown: shown.curves(episode, labels)))
+
+    @router.get("/viewer/datasets/{dataset}/episodes/{episode}/preview")
+    async def preview(request: Request, dataset: int, episode: int, labels: str | None = None) -> Response:
+        with limits.decoding() as take:
+            return _json(await read(request, dataset, lambda shown: shown.preview(episode, labels, take)))
+
+    @router.get("/viewer/datasets/{dataset}/episodes/{episode}/videos/{camera}")
+    async def video(request: Request, dataset: int, episode: int, camera: int) -> Response:
+        with limits.decoding() as take:
+            clip = await read(request, dataset, lambda shown: shown.video(episode, camera, take))
+        return Response(clip, media_type="video/mp4", headers=_HEADERS)
+
+    return router
+
+
+def _json(document: dict[str, Any]) -> Response:
+    """Return an answer in JSON, with null for NaN, which JSON does not have."""
+    return Response(to_json(document, inf_nan_mode="null"), media_type="application/json")

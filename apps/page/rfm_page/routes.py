@@ -11,6 +11,7 @@ import asyncio
 import itertools
 import logging
 import math
+import shlex
 import time
 from collections.abc import AsyncIterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,6 +25,7 @@ from pydantic_core import to_json
 from starlette.datastructures import UploadFile
 
 from rfm_client import (
+    FRAME_SCORES,
     AsyncRewardClient,
     InvalidSampleError,
     ModelInfo,
@@ -39,13 +41,22 @@ from rfm_client.frames import BlankFrames, ChannelOrder, Orientation, Rule, Samp
 from rfm_client.serving import off_loop
 from rfm_gateway.mounting import GatewayConfig, PageHost, invalid, while_connected
 from rfm_page.questions import DEFAULT_FPS, ShownVideo, VideoRequest
-from rfm_page.remedies import remedies
-from rfm_page.scores import ABOUT
 
 MOST_PREFIXES = 32  # in a request
 MOST_BYTES = 64 * 2**20  # of the frames in a request
 STATUS_TIMEOUT_S = 5.0
 _AS_THEY_COME = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}  # the second tells proxies not to buffer
+
+_INSTEAD = {name: FRAME_SCORES[name] for name in (score.replaced_by for score in FRAME_SCORES.values()) if name}
+_SCORES: dict[str, dict[str, Any]] = {  # what the page's axes need
+    name: {
+        "short": f"time {score.short(name)}" if score.unit == "s" else score.short(name),
+        "unit": score.unit,
+        "bounds": [*score.bounds],
+    }
+    for name, score in _INSTEAD.items()
+}
+_REPOSITORY, _CHECKPOINT, _DATASET = "my_models", "my_checkpoint", "my_dataset"  # stand for paths of the user
 
 logger = logging.getLogger("rfm_gateway")
 
@@ -70,8 +81,8 @@ def viewer_routes(host: PageHost) -> APIRouter:
     async def server() -> Response:
         rules = [{"name": rule, "frames": _frames_of(rule)} for rule in get_args(Rule)]
         about: dict[str, Any] = {"rules": rules, "orientations": get_args(Orientation)}
-        about |= {"channel_orders": get_args(ChannelOrder), "scores": ABOUT, "fps": DEFAULT_FPS}
-        return JSONResponse({**about, "url": config.triton_url, "remedies": remedies(config, host.started_by)})
+        about |= {"channel_orders": get_args(ChannelOrder), "scores": _SCORES, "fps": DEFAULT_FPS}
+        return JSONResponse({**about, "url": config.triton_url, "remedies": _remedies(config, host.started_by)})
 
     @router.get("/viewer/served")
     async def served() -> Response:
@@ -229,3 +240,29 @@ async def _preferences(client: AsyncRewardClient, asked: _Asked) -> dict[str, An
 
 def _event(name: str, **document: Any) -> str:
     return f"event: {name}\ndata: {to_json(document, inf_nan_mode='null').decode()}\n\n"  # JSON has no NaN
+
+
+def _remedies(config: GatewayConfig, started_by: str) -> dict[str, str | bool]:
+    """Return a command line for each fault, with the options of the command that started the page.
+
+    start: the server has ended
+    dataset: no dataset is there
+    triton: Triton does not answer
+    model: Triton serves no model
+    starts_triton: True: ``start`` also starts Triton
+    """
+    url = shlex.quote(config.triton_url)
+    port = str(config.address.port)
+    is_beside = started_by == "rfm serve"
+    start = (
+        f"{started_by} {_REPOSITORY} --gateway-port {port}"
+        if is_beside
+        else f"{started_by} --triton {url} --port {port}"
+    )
+    return {
+        "start": start,
+        "dataset": f"{start} {'--gateway-dataset' if is_beside else '--dataset'} {_DATASET}",
+        "triton": f"rfm-client status --url {url}" if is_beside else f"rfm serve {_REPOSITORY}",
+        "model": f"rfm export {_CHECKPOINT} --repository {_REPOSITORY}",
+        "starts_triton": is_beside,
+    }

@@ -8,18 +8,21 @@ from __future__ import annotations
 
 import base64
 import io
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
+import av
 import numpy as np
 import numpy.typing as npt
 from fastapi import HTTPException
 from PIL import Image
 
+from rfm_client import UInt8Array
 from rfm_client.episodes import SuccessRule
 from rfm_client.frames import ChannelOrder, Correction, Orientation
 from rfm_labels import (
@@ -39,12 +42,13 @@ Read = TypeVar("Read")
 
 _SUMMARIES_AT_A_TIME = 8  # summaries in memory
 _POINTS = 32  # of a preview's curve
+_CODING = {"crf": "12", "g": "10", "preset": "veryfast"}  # of H.264: hardly any loss, and quick to move in
 _PREVIEW_PX = (96, 72)  # width and height, at most
 
 
 @dataclass(frozen=True)
-class ShownDataset(ABC):
-    """A dataset for the page.
+class ShownDataset:
+    """A dataset for the page, whose pictures are encoded as videos; without a subclass, an RLDS dataset.
 
     dataset: as ``open_to_show`` returns it
     Its methods raise DatasetError for a broken dataset, HTTPException 404 for a missing episode, camera or label file.
@@ -62,32 +66,32 @@ class ShownDataset(ABC):
         """The folder or file."""
         return self.root
 
-    @abstractmethod
     def check(self) -> None:
         """Raise DatasetError if the dataset would show other files of this machine. Before every reading."""
+        check_links(self.root, links_in(self.root))
 
     @property
-    @abstractmethod
     def has_stored_pixels(self) -> bool:
         """True if the videos have every pixel as stored; False: some are encoded for the page."""
+        return False
 
     @property
-    @abstractmethod
     def cameras(self) -> Sequence[str]:
         """The cameras whose videos the page shows."""
+        return self.dataset.cameras
 
     @property
-    @abstractmethod
     def fps(self) -> float:
-        """Frames a second of the videos."""
+        """Frames a second of the videos. An RLDS dataset does not say."""
+        return 10.0
 
-    @abstractmethod
     def times_s(self, episode: DatasetEpisode) -> npt.NDArray[np.float64]:
-        """Return float64 [T], the time of each frame. Raises DatasetError."""
+        """Return float64 [T], the time of each frame; at equal distances in a dataset without times."""
+        return np.arange(episode.num_frames) / self.fps
 
-    @abstractmethod
     def mp4(self, episode: DatasetEpisode, camera: str, take: Callable[[int], object]) -> bytes:
-        """Return an episode's video as an MP4 file. take: as of ``video``. Raises DatasetError."""
+        """Return an episode's video as an MP4 file. take: as of ``video``"""
+        return encoded(self.dataset.stored_frames(episode, camera), self.fps, take)
 
     def read(self, reading: Callable[[ShownDataset], Read]) -> Read:
         """Check the dataset, then read from it. Raises HTTPException 500 with the fault of a broken dataset."""
@@ -273,3 +277,64 @@ def _scores(curve: Curve, frames: npt.NDArray[np.int64], num_frames: int) -> dic
             of_all[frames] = labelled
             scores[name] = of_all.tolist()
     return scores
+
+
+def encoded(frames: Iterator[UInt8Array], fps: float, take: Callable[[int], object]) -> bytes:
+    """Return pictures as an MP4 file of nearly the same colours.
+
+    frames: uint8 [H, W, 3] each
+    take: called with a number of bytes before they are allocated
+    """
+    video = io.BytesIO()
+    with av.open(video, "w", format="mp4") as container:
+        stream: Any = None
+        for frame in frames:
+            even = np.pad(frame, [(0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)], "edge")  # for H.264
+            if stream is None:
+                stream = container.add_stream("libx264", Fraction(fps).limit_denominator(1000), options=_CODING)
+                stream.height, stream.width, stream.pix_fmt = *even.shape[:2], "yuv420p"
+                take(even.nbytes)
+            _mux(container, stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")), take)
+        _mux(container, stream.encode(None), take)
+    return video.getvalue()
+
+
+def _mux(container: Any, packets: Sequence[Any], take: Callable[[int], object]) -> None:
+    for packet in packets:
+        take(packet.size)
+        container.mux(packet)
+
+
+def links_in(folder: Path) -> Iterator[Path]:
+    """Yield all links below a folder; 100,000 files take 0.1 s.
+
+    Raises DatasetError for a folder that hides them, and for pipes, sockets and devices, which reading would wait for.
+    """
+    if not os.access(folder, os.X_OK):  # nothing in it can be opened
+        return
+    try:
+        with os.scandir(folder) as entries:
+            others = [entry for entry in entries if entry.is_symlink() or not entry.is_file()]
+    except OSError as error:
+        raise DatasetError.at(folder, "a folder whose files can be listed", error.strerror) from error
+    for entry in others:
+        if entry.is_symlink():
+            yield Path(entry.path)
+        elif entry.is_dir():
+            yield from links_in(Path(entry.path))
+        else:
+            raise DatasetError.at(Path(entry.path), "a file or a folder", "a pipe, a socket or a device")
+
+
+def check_links(root: Path, paths: Iterable[Path]) -> None:
+    """Raise DatasetError for a path whose file is not in ``root``, a folder with links resolved.
+
+    The dataset's author could show other files of this machine.
+    """
+    for path in paths:
+        try:
+            is_inside = path.resolve().is_relative_to(root)
+        except (OSError, RuntimeError):  # links in a circle
+            is_inside = False
+        if not is_inside:
+            raise DatasetError.at(path, "a file in the dataset's folder", "a link that leaves it: copy the file there")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Refuse requests of web pages that the gateway did not serve.
+"""Refuse requests without the key, and those of web pages that the gateway did not serve.
 
 A page of another site can send requests to addresses that only its visitor can reach, such as 127.0.0.1. Browsers say
 so in ``Origin`` and ``Sec-Fetch-Site``, which no page can change. With DNS rebinding, the page's own name leads to such
@@ -9,19 +9,39 @@ TrustedHostMiddleware knows names alone, no rule for IP addresses; its CORSMiddl
 
 from __future__ import annotations
 
+import base64
 import ipaddress
+import secrets
 import socket
+from collections.abc import Awaitable, Callable
+from typing import Annotated
 from urllib.parse import urlsplit
 
+from fastapi import Depends, HTTPException
+from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
+from fastapi.security.http import HTTPBase
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rfm_gateway.config import GatewayConfig
-from rfm_gateway.refusals import Refusals
+from rfm_gateway.refusals import refuse
 
 _NEVER_PUBLIC = ("local", "internal", "lan", "svc")  # top-level domains that the public DNS does not have
 _MOST_LETTERS = 100  # of a header in an answer
+_HEADER = APIKeyHeader(name="X-API-Key", auto_error=False)  # at module level, where FastAPI resolves annotations
+_BEARER = HTTPBearer(auto_error=False)
+_BASIC = HTTPBase(
+    scheme="basic",
+    scheme_name="HTTPBasic",
+    description="The key as password, with any user name: http://any:KEY@HOST.",
+    auto_error=False,
+)
+_EXPECTED_KEY = (
+    "key: expected it in X-API-Key, in Authorization: Bearer, or as the password of HTTP Basic (http://any:KEY@HOST), "
+    "got another or none"
+)
+_CHALLENGE = "Bearer"  # not Basic, for which a browser would ask its user for a password
 
 
 class ForeignPageMiddleware:
@@ -30,8 +50,8 @@ class ForeignPageMiddleware:
     has_key: True: every host is taken, since a page has no key
     """
 
-    def __init__(self, app: ASGIApp, config: GatewayConfig, refusals: Refusals, *, has_key: bool) -> None:
-        self._app, self._refusals = app, refusals
+    def __init__(self, app: ASGIApp, config: GatewayConfig, *, has_key: bool) -> None:
+        self._app = app
         self._origins = config.cors_origin
         self._has_key = has_key
         self._is_local = config.address.is_loopback
@@ -58,12 +78,12 @@ class ForeignPageMiddleware:
             expected = "localhost or an IP address" if self._is_local else "a local name or an IP address"
             remedy = "start the gateway with a key, or name this host: --allow-host (rfm serve: --gateway-allow-host)"
             detail = f"host: expected {expected}, got {host[:_MOST_LETTERS]!r}; {remedy}"
-            return self._refusals.answer(scope, 421, detail)
+            return refuse(scope, 421, detail)
         if self._is_foreign(headers, scope["method"]):
             got = headers.get("origin") or "none, of another site"
             remedy = "start the gateway with --cors-origin (rfm serve: --gateway-cors-origin) to allow it"
             detail = f"origin: expected the gateway's own, got {got[:_MOST_LETTERS]!r}; {remedy}"
-            return self._refusals.answer(scope, 403, detail)
+            return refuse(scope, 403, detail)
         return None
 
     def _is_known(self, host: str) -> bool:
@@ -93,3 +113,31 @@ class ForeignPageMiddleware:
             return origin is not None and origin.partition("://")[2] != headers.get("host")
         follows_link = method in ("GET", "HEAD") and headers.get("sec-fetch-dest") == "document"  # no page reads it
         return site not in ("same-origin", "none") and not follows_link
+
+
+def key_check(key: str) -> Callable[..., Awaitable[None]]:
+    """Return a dependency that refuses requests without the key."""
+    expected = key.encode()
+
+    async def check(  # not in a thread, as FastAPI would run a plain function
+        in_header: Annotated[str | None, Depends(_HEADER)],
+        in_bearer: Annotated[HTTPAuthorizationCredentials | None, Depends(_BEARER)],
+        in_basic: Annotated[HTTPAuthorizationCredentials | None, Depends(_BASIC)],
+    ) -> None:
+        bearer = in_bearer.credentials if in_bearer is not None else ""
+        given = ((in_header or "").encode(), bearer.encode(), _password(in_basic))
+        matches = [secrets.compare_digest(each, expected) for each in given]  # all, in constant time
+        if not any(matches):
+            raise HTTPException(401, _EXPECTED_KEY, {"WWW-Authenticate": _CHALLENGE})
+
+    return check
+
+
+def _password(credentials: HTTPAuthorizationCredentials | None) -> bytes:
+    """Return the password of HTTP Basic; empty: another scheme, or malformed."""
+    if credentials is None or credentials.scheme.lower() != "basic":
+        return b""
+    try:
+        return base64.b64decode(credentials.credentials).partition(b":")[2]
+    except ValueError:
+        return b""
