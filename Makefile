@@ -56,7 +56,7 @@ nightly: check ops-tools $(LEROBOT)
 test-newest: $(INSTALLED) $(LEROBOT)
 	$(BIN)/uv venv --quiet --clear --python 3.12 $(VENV)/newest
 	$(UV_SETTINGS) $(BIN)/uv pip install --quiet --python $(VENV)/newest --editable "client[cli,rerun]" --editable apps/gateway \
-	  --editable "apps/labels[hdf5,ray,rerun,rlds]" --editable apps/page --editable "apps/rl[sb3]" \
+	  --editable "apps/labels[hdf5,ray,rlds]" --editable apps/page --editable "apps/rl[sb3]" \
 	  --editable ".[encoders,vlm,quantized,demo,dev]" peft torchrl
 	$(BIN)/python tools/tritonserver.py $(VENV)/newest/server
 	for environment in newest lerobot; do $(BIN)/uv pip list --python $(VENV)/$$environment | grep -E "^($(NEWEST)) "; done
@@ -220,7 +220,7 @@ $(RUNS): $(PINS) | $(BIN)/uv
 	touch $@
 
 $(INSTALLED): $(PINS) | $(BIN)/uv
-	$(INSTALL) --editable "client[cli,rerun]" --editable apps/gateway --editable "apps/labels[hdf5,ray,rerun,rlds]" \
+	$(INSTALL) --editable "client[cli,rerun]" --editable apps/gateway --editable "apps/labels[hdf5,ray,rlds]" \
 	  --editable apps/page --editable "apps/rl[sb3]" --editable ".[encoders,vlm,quantized,triton,demo,dev]"
 	touch $(RUNS) $@
 

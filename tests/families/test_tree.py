@@ -102,6 +102,14 @@ def test_a_batch_of_trees_gives_the_scores_of_separate_prefixes(settings: str, m
     assert_as_separate(topreward(settings), [*MIXED, sample(40)], monkeypatch)
 
 
+@pytest.mark.parametrize("frame_steps", [0, 4], ids=["TOPReward", "dense mode"])
+def test_a_tree_does_not_depend_on_its_batch(frame_steps: int) -> None:
+    engine = robometer() if frame_steps else topreward()
+    samples = [replace(each, frame_steps=frame_steps) for each in MIXED]
+    for each, together in zip(samples, values(engine.evaluate(samples)), strict=True):
+        np.testing.assert_allclose(together, values(engine.evaluate([each]))[0], rtol=0, atol=TOLERANCE)
+
+
 @pytest.mark.parametrize(
     "bounds",
     [
