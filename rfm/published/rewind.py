@@ -19,7 +19,7 @@ from rfm.config import CheckpointConfig
 from rfm.families.rewind.checkpoint import MODEL_TYPE, RewindCheckpoint
 from rfm.families.rewind.encoders import Encoders
 from rfm.families.rewind.network import RewindConfig
-from rfm.families.rewind.pretrained import load_config, load_preprocessor
+from rfm.families.rewind.pretrained import IMAGE_MODELS, TEXT_MODELS, load_config, load_preprocessor
 from rfm.files import (
     NETWORK_CONFIG,
     RUN_CONFIG,
@@ -62,7 +62,7 @@ _TEXT: dict[str, Any] = {
 
 def image_facts(source: str) -> dict[str, Any]:
     """Return the settings in an image encoder's files, as JSON. Raises OSError, ValueError, CheckpointError."""
-    config, images = load_config(source), load_preprocessor(source)
+    config, images = load_config(source, IMAGE_MODELS), load_preprocessor(source)
     of_images = {
         "resize_px": images.resize_px,
         "crop_px": list(images.crop_px),
@@ -73,8 +73,8 @@ def image_facts(source: str) -> dict[str, Any]:
 
 
 def text_facts(source: str) -> dict[str, Any]:
-    """Return the settings in a text encoder's files, as JSON. Raises OSError, ValueError."""
-    config = load_config(source)
+    """Return the settings in a text encoder's files, as JSON. Raises OSError, ValueError, CheckpointError."""
+    config = load_config(source, TEXT_MODELS)
     return {name: getattr(config, name, None) for name in (*_OF_BOTH, "vocab_size")}
 
 

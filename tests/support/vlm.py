@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from inspect import signature
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,13 @@ def upstream_inputs(predictor: VlmPredictor, rows: Sequence[VlmRow]) -> dict[str
     merged = batch.inputs["pixel_values"].unflatten(0, (-1, UNIT))
     pixels = merged[batch.inputs["visual_features"]].flatten(0, 1)
     inputs = {"input_ids": batch.inputs["input_ids"], "attention_mask": mask}
+    backbone, kinds = predictor.network.model, "mm_token_type_ids"  # of tokens: text, picture, video
+    if kinds in signature(backbone.forward).parameters:  # since transformers 5
+        is_picture, is_video = (
+            (inputs["input_ids"] == token).int()
+            for token in (backbone.config.image_token_id, backbone.config.video_token_id)
+        )
+        inputs[kinds] = is_picture + 2 * is_video
     grids = [predictor.collator.grid(video) for row in rows for video in row.videos]
     if not predictor.network.config.multi_image:
         grid = torch.tensor([[each.groups, each.rows, each.columns] for each in grids])

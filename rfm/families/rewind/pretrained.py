@@ -13,7 +13,16 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from rfm.engine.layers import Normalisation
-from rfm.files import MAX_UINT8, PIL_BICUBIC, PREPROCESSOR_CONFIG, check_one_form, is_there, local_copy, read_json
+from rfm.files import (
+    MAX_UINT8,
+    NETWORK_CONFIG,
+    PIL_BICUBIC,
+    PREPROCESSOR_CONFIG,
+    check_one_form,
+    is_there,
+    local_copy,
+    read_json,
+)
 from rfm.weights import check_values
 from rfm_client.contract.description import FrameSize
 
@@ -135,11 +144,19 @@ def _has_counts(value: Any, *names: str) -> bool:
     return isinstance(value, dict) and set(value) == set(names) and all(map(_is_count, value.values()))
 
 
-def load_config(source: str | Path) -> Any:
-    """Load the configuration of a model's folder or id. Raises OSError and ValueError."""
+def load_config(source: str | Path, known: Sequence[str]) -> Any:
+    """Load the configuration of a model's folder or id.
+
+    known: the accepted types of models
+    Raises OSError, CheckpointError, and ValueError for another type.
+    """
     from transformers import AutoConfig
 
-    return AutoConfig.from_pretrained(local_copy(source), trust_remote_code=False)  # None would prompt the user
+    folder = local_copy(source)
+    kind = read_json(folder / NETWORK_CONFIG).get("model_type")
+    if kind not in known:
+        raise ValueError(f"{source}: model_type: expected one of {', '.join(known)}, got {kind}")
+    return AutoConfig.from_pretrained(folder, trust_remote_code=False)  # None would prompt the user
 
 
 def load_preprocessor(source: str | Path) -> ImagePreprocessor:
@@ -178,9 +195,7 @@ def load_model(source: str | Path, weights: Mapping[str, Tensor] | None, known: 
     from transformers import AutoModel
 
     options = {"dtype": torch.float32, "output_loading_info": True}
-    config = load_config(source)
-    if config.model_type not in known:
-        raise ValueError(f"{source}: model_type: expected one of {', '.join(known)}, got {config.model_type}")
+    config = load_config(source, known)
     folder = local_copy(source, with_weights=weights is None)
     check_one_form(folder)
     try:
