@@ -91,7 +91,7 @@ def test_the_table_and_the_curves_are_those_of_the_labels(get: Get, folders: lis
     names = [(None, "progress_sparse", "success"), *((each, f"progress.{each}", f"success.{each}") for each in CAMERAS)]
     for curve, (camera, *pair) in zip(shown["curves"], names, strict=True):
         assert curve["camera"] == camera
-        curves = np.float32([curve["progress"], curve["success"]])
+        curves = np.array([curve["progress"], curve["success"]], np.float32)
         np.testing.assert_array_equal(curves, [columns[name] for name in pair])
 
 
