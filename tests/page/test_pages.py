@@ -20,10 +20,7 @@ GATEWAY, PAGE = ROOT / "apps" / "gateway" / "rfm_gateway", ROOT / "apps" / "page
 FILES = {
     "": "text/html",
     "viewer/main.js": "javascript",
-    "viewer/page.css": "text/css",
-    "viewer/uplot/uPlot.esm.js": "javascript",
     "viewer/examples/success.mp4": "video/mp4",
-    "docs": "text/html",
     "docs/swagger-ui/swagger-ui.css": "text/css",
 }
 NO_FILES = ("viewer/missing.js", "viewer/routes.py", "viewer/..%2fapp.py", "viewer/%2fetc%2fpasswd", "viewer/a%00.css")
@@ -71,19 +68,11 @@ def test_without_a_page_the_gateway_serves_its_endpoints_alone(
             assert gateway.get(path).status_code == 200
 
 
-STARTED = {
-    "rfm serve": "rfm serve my_models --gateway-port 8100 --gateway-dataset my_dataset",
-    "rfm-client gateway": "rfm-client gateway --triton grpc://127.0.0.1:1 --port 8100 --dataset my_dataset",
-}
-
-
-@pytest.mark.parametrize(("started_by", "command"), STARTED.items(), ids=STARTED)
-def test_the_command_that_adds_a_dataset_has_the_options_of_the_one_that_started_the_gateway(
-    started_by: str, command: str
-) -> None:
-    app = create_app(GatewayConfig(triton="grpc://127.0.0.1:1", port=8100), started_by=started_by)
+def test_the_command_that_adds_a_dataset_has_the_options_of_the_one_that_started_the_gateway() -> None:
+    app = create_app(GatewayConfig(triton="grpc://127.0.0.1:1", port=8100), started_by="rfm-client gateway")
     with TestClient(app, "http://127.0.0.1") as gateway:
-        assert gateway.get("/viewer/server").json()["remedies"]["dataset"] == command
+        told = gateway.get("/viewer/server").json()["remedies"]["dataset"]
+    assert told == "rfm-client gateway --triton grpc://127.0.0.1:1 --port 8100 --dataset my_dataset"
 
 
 WITHOUT_LABELS = """

