@@ -18,7 +18,6 @@ from rfm_client import (
     AsyncRewardClient,
     FrameSize,
     InvalidSampleError,
-    ModelNotFoundError,
     ProgressResult,
     RewardClient,
     ServerUnavailableError,
@@ -132,17 +131,6 @@ def test_a_step_sends_its_new_frame_alone_and_nothing_is_encoded_twice(engines: 
     assert new == {MODEL: 12, IMAGES: 12, VIDEO: 2 * len(pairs)}
 
 
-def test_episodes_side_by_side_are_one_request_and_score_alike(transport: Recording, client: RewardClient) -> None:
-    videos = np.stack([video(seed, 7) for seed in (200, 201, 202)], axis=1)  # [T, N, H, W, 3]
-    tasks = ["stack the cups", "open the drawer", "stack the cups"]
-    episodes = client.episodes(3, tasks, frames=4)
-    added = [episodes.add(frames) for frames in videos]
-    assert len(transport.requests) == len(videos)
-    for index, task in enumerate(tasks):
-        assert_same(of_steps([step.of(index) for step in added]), offline(client, videos[:, index], task=task))
-    assert added[-1].step.tolist() == [6, 6, 6]
-
-
 class Failing(Recording):
     """A connection to the real server, which can be down."""
 
@@ -161,15 +149,16 @@ def test_episodes_are_shared_out_among_servers_and_stay(engines: EngineServer) -
     transports = [Recording(engines.url) for _ in range(3)]
     videos = np.stack([video(seed, 6) for seed in range(210, 216)], axis=1)  # [T, N, H, W, 3]
     with RewardClient([], transports=transports, model=MODEL) as client:
-        episodes = client.episodes(6, TASK, frames=4)
+        tasks = [TASK, "open the drawer"] * 3
+        episodes = client.episodes(6, tasks, frames=4)
         added = [episodes.add(frames) for frames in videos]
         for transport in transports:
             assert [len(inputs["num_frames"]) for inputs in transport.requests] == [2] * len(videos)
             assert transport.most_bytes < 2 * (videos[0, 0].nbytes + 512)
         first, second, third = (transport.digests for transport in transports)
         assert len(first | second | third) == len(first) + len(second) + len(third) == videos[:, :, 0, 0, 0].size
-        for index in range(6):
-            assert_same(of_steps([step.of(index) for step in added]), offline(client, videos[:, index]))
+        for index, task in enumerate(tasks):
+            assert_same(of_steps([step.of(index) for step in added]), offline(client, videos[:, index], task=task))
         for transport in transports:
             transport.requests.clear()
         episodes.reset([True, True, True, False, False, False])
@@ -206,6 +195,8 @@ def test_a_mask_leaves_episodes_out_and_a_reset_begins_some_anew(client: RewardC
     assert scores.step.tolist() == [1, 0]
     expected = offline(client, frames[[3]], task="open the drawer").progress[-1]
     assert scores.progress[1] == pytest.approx(expected, abs=TOLERANCE)
+    with pytest.raises(ValueError, match="expected one for each of 3 episodes"):
+        client.episodes(3, ["a", "b"])
     with pytest.raises(ValueError, match=r"mask: expected bool \[2\], got int64 \[2\]"):
         episodes.add(frames[[0, 1]], mask=[0, 1])
 
@@ -323,21 +314,6 @@ def test_kept_frames_are_scored_when_asked_and_several_episodes_in_one_request(
     assert score.progress == pytest.approx(scores[0].progress, abs=TOLERANCE)
 
 
-def test_kept_frames_stay_when_a_request_fails(engines: EngineServer) -> None:
-    server, frames = Failing(engines.url), video(122, 3)
-    with RewardClient([], transports=[server], model=MODEL, retry=False) as client:
-        episode = client.episode(TASK, frames=4)
-        for frame in frames:
-            episode.keep(frame)
-        server.is_down = True
-        with pytest.raises(ServerUnavailableError):
-            client.score_episodes([episode])
-        server.is_down = False
-        (score,) = client.score_episodes([episode])
-        assert score.progress == pytest.approx(offline(client, frames).progress[-1], abs=TOLERANCE)
-    episode.close()  # after the client
-
-
 SHORT, LONG = replace(V1, max_frames=4), replace(V2, max_frames=8)
 
 
@@ -394,13 +370,12 @@ def test_a_request_of_very_many_frames_is_refused_before_memory_is_taken(transpo
 
 
 FRAME = video(0, 1)[0]
-WRIST = {"cameras": ["front"]}
 REFUSED: dict[str, tuple[dict[str, Any], Any, str]] = {
     "not UTF-8": ({"task": "\ud800"}, FRAME, "task: expected text that UTF-8 can encode"),
     "a camera": ({"cameras": "front"}, FRAME, "^cameras: expected a sequence of names, got 'front'$"),
     "a camera's frame": ({}, {"a": FRAME}, r"frame: .* of one camera .*, got frames of \['a'\]"),
     "orient": (
-        {**WRIST, "orient": {"wrist": "rotate180"}},
+        {"cameras": ["front"], "orient": {"wrist": "rotate180"}},
         FRAME,
         r"^orient: expected some of the cameras \['front'\], got 'wrist'$",
     ),
@@ -417,14 +392,6 @@ def test_what_cannot_be_right_is_refused_with_its_environment(given: dict[str, A
         if frame is not None:
             episode.keep(frame)
         client.score_episodes([episode])
-
-
-def test_a_model_that_is_not_served_and_tasks_that_are_too_few_are_told(engines: EngineServer) -> None:
-    with engines.client("not_served") as client:
-        with pytest.raises(ModelNotFoundError):
-            client.episode(TASK, frames=4).add(video(0, 1)[0])
-        with pytest.raises(ValueError, match="expected one for each of 3 episodes"):
-            client.episodes(3, ["a", "b"])
 
 
 def test_an_episode_goes_on_when_the_server_has_forgotten_its_frames(engines: EngineServer) -> None:

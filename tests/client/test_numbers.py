@@ -45,41 +45,30 @@ COUNTS = {
     **giving(RayOptions, "actors"),
     **giving(client, "max_in_flight"),
 }
-FROM_0: dict[str, Given] = {"LabelOptions.episodes": lambda value: LabelOptions(episodes=[value])}
-POSITIVES = giving(client, "timeout_s")
-FINITES = {**giving(RewardOptions, "scale"), **giving(RayOptions, "num_gpus_per_actor")}
 NO_NUMBERS = [math.nan, math.inf, True, "8"]
+KINDS: list[tuple[dict[str, Given], list[Any], list[Any]]] = [  # and what is refused and what is taken
+    (SHARES, [-0.01, 1.01], [0, np.float32(0.8)]),
+    (COUNTS, [0, 2.5], [np.int64(8)]),
+    ({"LabelOptions.episodes": lambda value: LabelOptions(episodes=[value])}, [-1, 2.5], [0, np.int64(8)]),
+    (giving(client, "timeout_s"), [0, -1], [np.float32(0.5)]),
+    ({**giving(RewardOptions, "scale"), **giving(RayOptions, "num_gpus_per_actor")}, [], [0, np.float32(0.5)]),
+]
 
 
 def cases(kinds: dict[str, Given], values: list[Any]) -> list[Any]:
     return [pytest.param(give, value, id=f"{name}-{value!r}") for name, give in kinds.items() for value in values]
 
 
-@pytest.mark.parametrize(
-    ("give", "value"),
-    [
-        *cases(SHARES, [*NO_NUMBERS, -0.01, 1.01]),
-        *cases(COUNTS, [*NO_NUMBERS, 0, 2.5]),
-        *cases(FROM_0, [*NO_NUMBERS, -1, 2.5]),
-        *cases(POSITIVES, [*NO_NUMBERS, 0, -1]),
-        *cases(FINITES, NO_NUMBERS),
-    ],
-)
+REFUSED = [case for kinds, refused, _ in KINDS for case in cases(kinds, [*NO_NUMBERS, *refused])]
+
+
+@pytest.mark.parametrize(("give", "value"), REFUSED)
 def test_a_number_that_cannot_hold_is_refused(give: Given, value: Any) -> None:
     with pytest.raises(ValueError, match=r"^\w+: expected .*, got "):
         give(value)
 
 
-@pytest.mark.parametrize(
-    ("give", "value"),
-    [
-        *cases(SHARES, [0, np.float32(0.8)]),
-        *cases(FROM_0, [0, np.int64(8)]),
-        *cases(COUNTS, [np.int64(8)]),
-        *cases(POSITIVES, [np.float32(0.5)]),
-        *cases(FINITES, [0, np.float32(0.5)]),
-    ],
-)
+@pytest.mark.parametrize(("give", "value"), [case for kinds, _, taken in KINDS for case in cases(kinds, taken)])
 def test_a_number_may_be_numpy_s(give: Given, value: Any) -> None:
     give(value)
 

@@ -67,11 +67,6 @@ def silent(connection: socket.socket) -> None:
     connection.close()
 
 
-def dying(connection: socket.socket) -> None:
-    connection.recv(65536)
-    connection.close()
-
-
 def saying(content: bytes) -> Callable[[socket.socket], None]:
     def answer(connection: socket.socket) -> None:
         connection.recv(65536)
@@ -81,6 +76,7 @@ def saying(content: bytes) -> Callable[[socket.socket], None]:
     return answer
 
 
+dying = saying(b"")
 Misbehaviour = Callable[[socket.socket], None]
 MISBEHAVING: dict[str, tuple[str, Misbehaviour, type[RewardError], bool]] = {
     "http, no answer": ("http", silent, DeadlineExceededError, False),
@@ -114,13 +110,8 @@ def test_whatever_answers_the_error_is_ours(
 
 def test_a_redirect_is_told_and_never_followed() -> None:
     """It would carry frames and headers to an unknown server."""
-    arrived: list[bytes] = []
-
-    def stranger(connection: socket.socket) -> None:
-        arrived.append(connection.recv(65536))
-        connection.close()
-
-    with listening(stranger) as other:
+    arrived: list[socket.socket] = []
+    with listening(arrived.append) as other:
         head = "HTTP/1.1 307 Temporary Redirect\r\nLocation: {}\r\nContent-Length: 0\r\n\r\n"
         with listening(saying(head.format(f"http://127.0.0.1:{other}/v2").encode())) as port:
             url = f"http://127.0.0.1:{port}"

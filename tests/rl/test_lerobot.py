@@ -102,7 +102,6 @@ def test_pixels_arrive_exactly_and_upright(recorder: Recorder) -> None:
 REFUSED = {
     "normalized": ({KEY: PIXELS / 127.5 - 1, "task": TASK}, r"^sample 0 of the batch: .* got values from -1 to 1"),
     "floats in 0..255": ({KEY: PIXELS.float(), "task": TASK}, "sample 0 .* got values from 0 to 255"),
-    "NaN": ({KEY: PIXELS * float("nan"), "task": TASK}, "got values from nan"),
     "grey": ({KEY: PIXELS[:, :, :1], "task": TASK}, r"got uint8 \[5, 1, 48, 64\]"),
     "no batch": ({KEY: PIXELS[0, 0], "task": TASK}, r"expected images \[B, 3, H, W\], .* got \[3, 48, 64\]$"),
     "another camera": (
@@ -155,7 +154,7 @@ class SuccessAlone(CodeReader):
         return {"success": [self.success] * len(codes)}
 
 
-@pytest.mark.parametrize(("success", "reward"), [(0.9, 1.0), (0.8, 1.0), (0.7, 0.0), (float("nan"), None)])
+@pytest.mark.parametrize(("success", "reward"), [(0.8, 1.0), (0.7, 0.0), (float("nan"), None)])
 def test_the_reward_of_success_is_one_or_zero(success: float, reward: float | None) -> None:
     server = SuccessAlone()
     server.success = success

@@ -142,16 +142,11 @@ def test_all_that_stable_baselines3_shows_is_the_reward_model_s(
     client.close()
 
 
-RELABELLED: dict[str, Callable[[RewardClient], Any]] = {
-    name: WRAPPINGS[name] for name in ("a VecMonitor outside", "a Monitor inside", "a Monitor outside one environment")
-}
-
-
-@pytest.mark.parametrize("wrapping", RELABELLED.values(), ids=RELABELLED)
-def test_hindsight_relabelling_is_refused(recorder: Recorder, wrapping: Callable[[RewardClient], Any]) -> None:
+@pytest.mark.parametrize("name", ["a VecMonitor outside", "a Monitor inside", "a Monitor outside one environment"])
+def test_hindsight_relabelling_is_refused(recorder: Recorder, name: str) -> None:
     """Four fifths of a batch would have the environment's own reward."""
     settings = {"replay_buffer_class": HerReplayBuffer, "learning_starts": 4 * LENGTH, "buffer_size": 100}
-    model = SAC("MultiInputPolicy", wrapping(recorder), device="cpu", **settings)
+    model = SAC("MultiInputPolicy", WRAPPINGS[name](recorder), device="cpu", **settings)
     refusal = "compute_reward: expected no rewards for other goals, .* turn off hindsight relabelling"
     with pytest.raises(NotImplementedError, match=refusal):
         model.learn(8 * LENGTH)
@@ -190,14 +185,13 @@ def test_an_end_by_success_is_an_episode_for_statistics(inside: Any) -> None:
         assert evaluate_policy(model, model.env, 2) == (1, 0)
 
 
+def both(mode: AutoresetMode, each: Callable[[CodedEnv], Any] = lambda env: env) -> SyncVectorEnv:
+    return SyncVectorEnv([lambda n=n: each(CodedEnv(n, (3 + n,))) for n in range(2)], autoreset_mode=mode)
+
+
 INSIDE: dict[str, Callable[[AutoresetMode], Any]] = {
-    "each environment": lambda mode: SyncVectorEnv(
-        [lambda: RecordEpisodeStatistics(CodedEnv(0, (3,))), lambda: RecordEpisodeStatistics(CodedEnv(1, (4,)))],
-        autoreset_mode=mode,
-    ),
-    "the vector": lambda mode: RecordVectorStatistics(
-        SyncVectorEnv([lambda: CodedEnv(0, (3,)), lambda: CodedEnv(1, (4,))], autoreset_mode=mode)
-    ),
+    "each environment": lambda mode: both(mode, RecordEpisodeStatistics),
+    "the vector": lambda mode: RecordVectorStatistics(both(mode)),
 }
 
 
@@ -229,7 +223,7 @@ REFUSED: dict[str, tuple[Any, type[Exception], str]] = {
         r"^venv: expected each environment in RenderedFrame, .*: make_vec_env\(..., wrapper_class=RenderedFrame\)$",
     ),
     "a normalization": (
-        lambda: VecMonitor(VecNormalize(DummyVecEnv([lambda: RenderedFrame(Reach())]), norm_obs=False)),
+        lambda: VecMonitor(VecNormalize(rendered(), norm_obs=False)),
         ValueError,
         r"^venv: expected no VecNormalize inside.*; wrap in the other order: VecNormalize\(RewardModelVecEnv",
     ),

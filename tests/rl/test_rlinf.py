@@ -146,43 +146,28 @@ def test_a_task_that_may_be_the_next_episodes_is_refused(made: Any, tasks: bool)
     )
 
 
-def bad(**change: Any) -> dict[str, Any]:
-    return {**history([5, 3, 1]), **change}
+def pictures(**of_cameras: Any) -> dict[str, Any]:
+    return {"history_input": {"episode": of_cameras}}
 
 
-@pytest.mark.parametrize(
-    ("sent", "message"),
-    [
-        pytest.param(bad(task_descriptions=TASKS[:2]), "expected as many environments in each part", id="tasks"),
-        pytest.param(
-            bad(history_input={"episode": {"wrist_images": [[], [], []]}}),
-            r"history_input\['episode'\]: expected pictures under main_images",
-            id="camera",
-        ),
-        pytest.param(
-            bad(task_descriptions=None),
-            r"task_descriptions\[0\]: expected a sentence, or reward.model.rfm.task",
-            id="none",
-        ),
-        pytest.param(bad(task_descriptions=["", "a", "b"]), r"envs\[0\]", id="blank"),
-        pytest.param(
-            bad(history_input={"episode": {"main_images": [[VIDEOS[0][0] / 255], [], []]}}), r"envs\[0\]", id="floats"
-        ),
-        pytest.param(
-            bad(history_input=None),
-            r"history_input: expected the history .*reward_mode: history_buffer",
-            id="no history",
-        ),
-        pytest.param(
-            bad(dones=torch.tensor([True, False, False]), history_input={}),
-            r"envs\[0\]: expected the pictures of the episode that ended",
-            id="dropped",
-        ),
-    ],
-)
-def test_an_input_at_fault_is_an_error(made: Any, sent: dict[str, Any], message: str) -> None:
+FAULTS: dict[str, tuple[dict[str, Any], str]] = {
+    "tasks": ({"task_descriptions": TASKS[:2]}, "expected as many environments in each part"),
+    "camera": (pictures(wrist_images=[[]] * 3), r"history_input\['episode'\]: expected pictures under main_images"),
+    "none": ({"task_descriptions": None}, r"task_descriptions\[0\]: expected a sentence, or reward.model.rfm.task"),
+    "blank": ({"task_descriptions": ["", "a", "b"]}, r"envs\[0\]"),
+    "floats": (pictures(main_images=[[VIDEOS[0][0] / 255], [], []]), r"envs\[0\]"),
+    "no history": ({"history_input": None}, r"history_input: expected the history .*reward_mode: history_buffer"),
+    "dropped": (
+        {"dones": torch.tensor([True, False, False]), "history_input": {}},
+        r"envs\[0\]: expected the pictures of the episode that ended",
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), FAULTS.values(), ids=FAULTS)
+def test_an_input_at_fault_is_an_error(made: Any, change: dict[str, Any], message: str) -> None:
     with pytest.raises(InvalidSampleError, match=message):
-        made({"episode": {"input_on_done": True}}).compute_reward(sent)
+        made({"episode": {"input_on_done": True}}).compute_reward(history([5, 3, 1], **change))
 
 
 @pytest.mark.parametrize(
