@@ -42,10 +42,6 @@ def read(repository: Path, name: str) -> pb.ModelConfig:
     return text_format.Parse((repository / name / "config.pbtxt").read_text(), pb.ModelConfig())
 
 
-def dims(tensors: Any) -> dict[str, tuple[str, list[int]]]:
-    return {t.name: (pb.DataType.Name(t.data_type).removeprefix("TYPE_"), list(t.dims)) for t in tensors}
-
-
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     repository = tmp_path_factory.mktemp("exported") / "model_repository"
@@ -113,9 +109,9 @@ def test_a_model_may_gain_an_optional_input_and_lose_none(tmp_path: Path) -> Non
     for name in ("rfm_encoder", "rfm_frames"):
         forget_input(tmp_path, name, "second_frames")
     assert export(FRAMES, tmp_path) == 2
-    assert "second_frames" in dims(read(tmp_path, "rfm_frames").input)
+    assert "second_frames" in [each.name for each in read(tmp_path, "rfm_frames").input]
     assert export(FRAMES, tmp_path, feature_cache_mib=0) == 3
-    assert "frame_digests" not in dims(read(tmp_path, "rfm_frames").input)
+    assert "frame_digests" not in [each.name for each in read(tmp_path, "rfm_frames").input]
     config = read(tmp_path, "rfm_encoder")
     config.input.add(name="third_frames", data_type=pb.TYPE_UINT8, dims=[1], optional=True)
     (tmp_path / "rfm_encoder" / "config.pbtxt").write_text(text_format.MessageToString(config))
@@ -133,14 +129,6 @@ def test_encoders_that_do_not_fit_or_cannot_be_had_are_named(tmp_path: Path) -> 
         export(FRAMES, tmp_path, image_encoder="/no/such/folder")
 
 
-EVAL_CONFIG_SERVER = """
-model_path: "robometer/Robometer-4B"
-num_gpus: 1
-max_workers: 8
-batch_size: 4
-server_url: "0.0.0.0"
-server_port: 8000
-"""
 HEADS = ("progress", "preference", "success", "similarity")
 
 
@@ -192,7 +180,7 @@ def test_upstream_s_file_exports_whatever_its_batch_size_unless_it_names_gpus_th
 ) -> None:
     there, repository = torch.cuda.device_count(), tmp_path / "repository"
     file = tmp_path / "eval_config_server.yaml"
-    file.write_text(EVAL_CONFIG_SERVER.replace("num_gpus: 1", f"num_gpus: {there + 1}"))
+    file.write_text(f"model_path: robometer/Robometer-4B\nnum_gpus: {there + 1}\nbatch_size: 4\nserver_port: 8000\n")
     command = ["export", "--config", str(file), "--checkpoint", str(EMBEDDINGS.checkpoint)]
     command += ["--repository", str(repository)]
     refused = rfm(*command)
