@@ -71,10 +71,7 @@ def test_which_triton_others_may_reach(host: str, version: str, accepted: bool, 
 
 def test_files_of_tls_are_read_before_anything_starts(papers: Papers) -> None:
     for tls, told in (
-        (
-            GrpcTls(papers.certificate, papers.client_key),
-            "grpc_certificate: expected a certificate and its key",
-        ),
+        (GrpcTls(papers.certificate, papers.client_key), "grpc_certificate: expected a certificate and its key"),
         (GrpcTls(papers.certificate, papers.key, Path("/nowhere")), r"grpc_client_ca: .* \(PEM\) at /nowhere, got No"),
     ):
         with pytest.raises(ServerStartError, match=f"^{told}"):
