@@ -13,7 +13,7 @@ import pytest
 from commands import REPOSITORY, nothing_left_behind
 from in_process import rfm
 from repositories import changing
-from rfm.parameters import EXPORT_PARAMETER, PYTHON_PARAMETERS
+from rfm.parameters import EXPORT_PARAMETER, FAMILY_PARAMETER
 from rfm.serve.installation import ServerStartError
 from rfm.serve.repository import fault_in
 from rfm.serve.triton_server import TritonServer
@@ -39,33 +39,25 @@ def parameter(name: str, value: str | None) -> Callable[[Path], None]:
     return change
 
 
-DESCRIBED = "/rfm/config.pbtxt: parameter description: "
 AGAIN = "/config.pbtxt: .* got one of an older version; "
 DAMAGES: dict[str, tuple[str, Callable[[Path], object], str]] = {
-    "garbage": (
-        "rfm",
-        write_config("%%% nonsense {"),
-        "/rfm/config.pbtxt: expected a model's configuration, got 1:1 : ",
-    ),
+    "garbage": ("rfm", write_config("%%% {"), "/rfm/config.pbtxt: expected a model's configuration, got 1:1 : "),
     "empty": ("rfm", write_config(""), "/rfm/config.pbtxt: expected a model's configuration, got an empty file; "),
     "of no version": ("rfm", parameter(EXPORT_PARAMETER, None), f"/rfm{AGAIN}"),
     "of an older version": ("rfm_frames", parameter(EXPORT_PARAMETER, "0"), f"/rfm_frames{AGAIN}"),
     "of a newer version": ("rfm_encoder", parameter(EXPORT_PARAMETER, "999"), "/rfm_encoder/.* of a newer version; "),
-    "no program": ("rfm", lambda model: (model / "1/model.py").unlink(), "/rfm/1/model.py: expected the model's pro"),
+    "no programs": (
+        "rfm",
+        lambda model: [file.unlink() for file in model.parent.glob("rfm*/1/model.py")],
+        "/rfm/1/model.py: expected the model's program, .*; .*/rfm_encoder/1/model.py: expected ",
+    ),
     "no version": ("rfm", lambda model: shutil.rmtree(model / "1"), "/rfm/1: expected the folder of a version, got no"),
-    "no version of an ensemble": ("rfm_frames", lambda model: shutil.rmtree(model / "1"), "/rfm_frames/1: expected "),
-    **{
-        f"{told} in the description": ("rfm", parameter(DESCRIPTION_PARAMETER, value), f"{DESCRIBED}{message}")
-        for told, value, message in (
-            ("nothing", None, "expected the JSON object of an export, got none; "),
-            ("half", '{"kind"', "expected .* got '{\"kind\"': Expecting ':'"),
-            ("another type", '{"text_dim": "32"}', "text_dim: expected int or null, got '32'; "),
-        )
-    },
-    **{
-        name: ("rfm", parameter(name, None), f"/rfm/config.pbtxt: .* parameter {name}, got none; ")
-        for name in PYTHON_PARAMETERS
-    },
+    "a wrong description": (
+        "rfm",
+        parameter(DESCRIPTION_PARAMETER, '{"text_dim": "32"}'),
+        "/rfm/config.pbtxt: parameter description: text_dim: expected int or null, got '32'; ",
+    ),
+    "no family": ("rfm", parameter(FAMILY_PARAMETER, None), "/rfm/config.pbtxt: .* parameter family, got none; "),
 }
 
 
@@ -81,14 +73,6 @@ def test_a_repository_with_broken_files_is_refused_before_triton_starts(
     assert re.match(re.escape(str(repository)) + told, str(refused.value)), refused.value
     assert f"export again with `rfm export --checkpoint CHECKPOINT --repository {repository}`" in str(refused.value)
     assert refused.value.model == model
-
-
-def test_the_faults_of_several_models_are_told_together(tmp_path: Path) -> None:
-    repository = shutil.copytree(REPOSITORY, tmp_path / "models")
-    for model in ("rfm", "rfm_encoder"):
-        (repository / model / "1" / "model.py").unlink()
-    with pytest.raises(ServerStartError, match=r"/rfm/1/model\.py: .*; .*/rfm_encoder/1/model\.py: "):
-        TritonServer(repository, Endpoints.free(), find_installation()).start_ready()
 
 
 def test_a_model_with_broken_files_is_refused_before_a_running_server_loads_it(tmp_path: Path) -> None:

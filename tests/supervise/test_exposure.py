@@ -53,7 +53,6 @@ def test_an_older_triton_that_listens_elsewhere_is_stopped(tmp_path: Path, monke
     [
         ("127.0.0.2", "2.51.0", False, True),
         ("10.0.0.1", "2.51.0", True, True),
-        ("10.0.0.1", "2.51.0", False, False),
         ("127.evil.example", "2.51.0", False, False),
         ("10.0.0.1", "2.70.1", False, False),
         ("10.0.0.1", "2.71.0", False, True),
@@ -72,10 +71,7 @@ def test_which_triton_others_may_reach(host: str, version: str, accepted: bool, 
 
 def test_files_of_tls_are_read_before_anything_starts(papers: Papers) -> None:
     for tls, told in (
-        (
-            GrpcTls(papers.certificate, papers.client_key),
-            "grpc_certificate: expected a certificate and its key",
-        ),
+        (GrpcTls(papers.certificate, papers.client_key), "grpc_certificate: expected a certificate and its key"),
         (GrpcTls(papers.certificate, papers.key, Path("/nowhere")), r"grpc_client_ca: .* \(PEM\) at /nowhere, got No"),
     ):
         with pytest.raises(ServerStartError, match=f"^{told}"):

@@ -34,10 +34,6 @@ PLAIN = goldens.config("c1_t1_disc10")  # embeddings alone
 PARTS = ("rfm_encoder", "rfm", "rfm_frames")
 
 
-def models(command: str, *words: str) -> Result:
-    return rfm("models", command, *words)
-
-
 @dataclass(frozen=True)
 class Running:
     """An ``rfm serve`` with the reference checkpoint with encoders as ``rfm``, which asks for KEY."""
@@ -47,7 +43,9 @@ class Running:
 
     def ask(self, command: str, *words: str) -> Result:
         options = [f"--url={self.served.endpoints.grpc_url}", f"--admin-key-file={self.repository.parent / 'key'}"]
-        return models(command, *words, *options, *([] if command == "list" else [f"--repository={self.repository}"]))
+        return rfm(
+            "models", command, *words, *options, *([] if command == "list" else [f"--repository={self.repository}"])
+        )
 
     def models(self, command: str, *words: str) -> str:
         """Return the output of ``rfm models COMMAND``."""

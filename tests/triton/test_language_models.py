@@ -49,7 +49,7 @@ from rfm_client import (
 from rfm_rl import RewardModelWrapper, RewardOptions
 from robodopamine import case_named
 from servers import Endpoints, start_triton
-from viewer_requests import SCORE, SERVED, curve_of, events
+from viewer_requests import SCORE, SERVED, events
 
 fake_lerobot.provide()
 
@@ -161,17 +161,9 @@ def body(samples: list[ProgressSample], **more: bool) -> dict[str, Any]:
 
 def test_what_a_model_does_not_predict_is_none_or_an_error(asked: Served) -> None:
     with asked.client("top") as client:
-        (plain,) = client.evaluate(samples_of("top")[:1])
-    with asked.client("rynn") as client:
-        (timed,) = client.evaluate(samples_of("rynn")[:1])
+        assert client.progress(samples_of("top")[0].trajectory).log_prob is None
     with asked.client("forward") as client:
-        (skipping,) = client.evaluate(samples_of("forward")[:1])
-    assert isinstance(plain, ProgressResult)
-    assert isinstance(timed, ProgressResult)
-    assert isinstance(skipping, ProgressResult)
-    assert plain.log_prob is None
-    with pytest.raises(ValueError, match="this checkpoint does not predict it"):
-        _ = timed.last_progress
+        skipping = client.progress(samples_of("forward")[0].trajectory)
     assert skipping.is_answered.tolist() == [False, *[True] * (len(skipping.progress) - 1)]
     with pytest.raises(ValueError, match=r"progress: expected a score of each frame, got NaN: the model answered"):
         _ = skipping.progress_deltas
@@ -185,19 +177,13 @@ def test_steps_of_an_episode_are_those_of_the_original(asked: Served) -> None:
     assert steps == told.content["response"]["outputs_progress"]["progress_pred"][0]
 
 
-SAID = "2 of 2 frames: the model's written answer states no single whole score"
-
-
 def test_an_answer_without_a_score_fails_alone_and_unclear_answers_are_marked(asked: Served) -> None:
-    none, unclear, clear = (case("roboreward", name).samples()[0] for name in ("unparsable_T3", UNCLEAR, CLEAR))
+    samples = [case("roboreward", name).samples()[0] for name in ("unparsable_T3", UNCLEAR, CLEAR)]
     with asked.client("robo") as client:
-        first = client.progress(unclear.trajectory)
-        failed, *results = client.evaluate([none, unclear, clear], return_errors=True)
+        failed, *results = client.evaluate(samples, return_errors=True)
     assert isinstance(failed, InvalidSampleError)
     assert "answer: expected a score from 1 to 5 in the model's answer, got 'no idea'" in str(failed)
-    marks = [each.unclear if each.unclear is None else each.unclear.tolist() for each in (first, *results)]  # type: ignore[union-attr]
-    assert marks == [[True] * 2, [True] * 2, [False] * 4]
-    assert (first.last_progress, results[1].last_progress) == (1.0, 1.0)  # type: ignore[union-attr]
+    assert [each.unclear.tolist() for each in results] == [[True] * 2, [False] * 4]  # type: ignore[union-attr]
 
 
 def test_the_description_tells_what_is_given(asked: Served) -> None:
@@ -297,20 +283,22 @@ def test_the_gateway_answers_as_the_servers_of_the_originals(asked: Served) -> N
             assert "outputs_success" not in answer
 
 
-def by_page(gateway: TestClient, video: Path, **fields: object) -> Any:
-    with video.open("rb") as file:
-        return gateway.post(f"/{SCORE}", data=fields, files={"video": (video.name, file)})
-
-
 def test_the_gateway_and_the_page_answer_null_at_frames_without_an_answer(asked: Served, tmp_path: Path) -> None:
     case, video = case_named("baseline_T3_forward"), tmp_path / "video.mp4"
+
+    def by_page(gateway: TestClient, video: Path, **fields: object) -> Any:
+        given = {"task": case.sample.trajectory.task, **fields}
+        return gateway.post(f"/{SCORE}", data=given, files={"video": (video.name, video.read_bytes())})
+
     encode_here(video, case.sample.trajectory.positions, "libx264rgb", {"qp": "0"}, pixels="rgb24")
     (expected,) = case.engine().evaluate([case.sample])
     assert isinstance(expected, ProgressResult)
     with asked.gateway("forward") as gateway:
         answer = gateway.post("/evaluate_batch", json=body([case.sample])).json()
         served = gateway.get(f"/{SERVED}").json()["models"]
-        _, (_, points), _ = events(by_page(gateway, video, task=case.sample.trajectory.task, fps="10"))
+        _, (_, points), _ = events(by_page(gateway, video, fps="10"))
+        refused = by_page(gateway, video, sampling="rint", frames=4)
+    assert (refused.status_code, "relative to the whole episode" in refused.text) == (422, True)
     about = next(model for model in served if model["name"] == "forward")
     assert (about["rule"], about["reads_views"]) == ("all", True)
     assert (points["progress"][0], points["answered"]) == (None, [False, True, True])
@@ -318,19 +306,6 @@ def test_the_gateway_and_the_page_answer_null_at_frames_without_an_answer(asked:
     (values,) = answer["outputs_progress"]["progress_pred"]
     assert values[0] is None
     np.testing.assert_allclose(values[1:], expected.progress[1:], rtol=0, atol=1e-6)
-
-
-def test_the_page_shows_the_whole_episode_s_curve(asked: Served, tmp_path: Path) -> None:
-    asked.command("score", VIDEO, "--task", TASK, "--fps", "0.5", "--json", tmp_path / "scores.json", model="top")
-    (told,) = json.loads((tmp_path / "scores.json").read_text())["videos"]
-    with asked.gateway("top") as gateway:
-        curve = curve_of(events(by_page(gateway, VIDEO, task=TASK, fps=0.5)))
-        refused = by_page(gateway, VIDEO, task=TASK, sampling="rint", frames=4)
-    np.testing.assert_allclose(curve["progress"], told["progress"], rtol=0, atol=1e-4)
-    assert len(told["log_prob"]) == len(told["progress"])
-    assert {*curve["success"]} == {None}
-    assert refused.status_code == 422
-    assert "relative to the whole episode" in refused.text
 
 
 def test_remaining_seconds_are_shown_in_tables_pictures_and_on_the_page(
@@ -370,16 +345,15 @@ def test_remaining_seconds_are_shown_in_tables_pictures_and_on_the_page(
 
 
 def test_score_says_how_many_answers_are_unclear(asked: Served, tmp_path: Path) -> None:
-    files = []
     for name in (UNCLEAR, CLEAR):
-        sample = case("roboreward", name).samples()[0]
-        files.append(tmp_path / f"{name}.npy")
-        np.save(files[-1], sample.trajectory.positions)
-        task = sample.trajectory.task
-    lines = asked.command("score", *files, "--task", task, "--json", tmp_path / "scores.json", model="robo")
-    told = [video["unclear"] for video in json.loads((tmp_path / "scores.json").read_text())["videos"]]
+        trajectory = case("roboreward", name).samples()[0].trajectory
+        np.save(tmp_path / f"{name}.npy", trajectory.positions)
+    files, scores = [tmp_path / f"{name}.npy" for name in (UNCLEAR, CLEAR)], tmp_path / "scores.json"
+    lines = asked.command("score", *files, "--task", trajectory.task, "--json", scores, model="robo")
+    told = [video["unclear"] for video in json.loads(scores.read_text())["videos"]]
     assert told[0] == [True, True]
-    assert f"note: {files[0]}: {SAID}" in lines
+    said = "2 of 2 frames: the model's written answer states no single whole score"
+    assert f"note: {files[0]}: {said}" in lines
     assert lines.count("no single whole score") == sum(map(any, told))
 
 
