@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import random
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -21,7 +20,7 @@ import hdf5_writers as writers
 from client_commands import invoke
 from hdf5_writers import RGB_MARK, TASK, decoded, jpeg, video
 from labelling import BrightnessScorer, Notes
-from rfm_client import FrameSize, InvalidSampleError, ProgressResult, ProgressSample, RewardError
+from rfm_client import FrameSize, InvalidSampleError, ProgressResult, ProgressSample
 from rfm_client.frames import Correction, resize_frames
 from rfm_labels import CheckpointFacts, DatasetError, LabelOptions, find_label_files, label, open_dataset
 
@@ -393,21 +392,6 @@ def test_notes_list_what_is_left_out_and_the_rest_is_labelled(
     assert report.summary.num_frames == 3 * NUM_FRAMES
     settings = ("cameras:", "sampling:", "frames:", "orient:")
     assert [line for line in notes.lines if not line.startswith(settings)] == lines
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_a_damaged_file_is_read_or_refused(three: Path, seed: int) -> None:
-    whole, draw = three.read_bytes(), random.Random(seed)
-    for number in range(15):
-        damaged = bytearray(whole)
-        for _ in range(draw.choice((1, 4, 16))):
-            damaged[draw.randrange(len(whole))] = draw.randrange(256)
-        three.write_bytes(damaged)
-        try:
-            options = LabelOptions(overwrite=True, parts=str(three.with_name(f"{number}")))
-            label(open_dataset(three, task=TASK), BrightnessScorer(), options)
-        except (RewardError, OSError):
-            pass
 
 
 # Files of one episode

@@ -109,10 +109,11 @@ class EngineServer(service_pb2_grpc.GRPCInferenceServiceServicer):
 
     def forget_features(self) -> None:
         """Empty the caches of frames, as a restart does."""
-        for model in self._models.values():
-            holder = getattr(model.model, "engine", model.model) if model.config.backend else None
-            if holder is not None and holder.cache is not None:
-                holder.cache.clear()
+        with self._working:  # an abandoned request may still load a checkpoint
+            for model in self._models.values():
+                holder = getattr(model.model, "engine", model.model) if model.config.backend else None
+                if holder is not None and holder.cache is not None:
+                    holder.cache.clear()
 
     def _load(self, name: str) -> None:
         """Load the checkpoint with this name, and its encoders."""
@@ -153,7 +154,7 @@ class EngineServer(service_pb2_grpc.GRPCInferenceServiceServicer):
 
     def RepositoryIndex(self, request: Any, context: Any) -> Any:  # noqa: N802
         index = service_pb2.RepositoryIndexResponse
-        return index(models=[index.ModelIndex(name=name, version="1", state="READY") for name in self._models])
+        return index(models=[index.ModelIndex(name=name, version="1", state="READY") for name in list(self._models)])
 
     def ModelReady(self, request: Any, context: Any) -> Any:  # noqa: N802
         return service_pb2.ModelReadyResponse(ready=bool(self._find(request.name, context)))
@@ -162,7 +163,7 @@ class EngineServer(service_pb2_grpc.GRPCInferenceServiceServicer):
         return service_pb2.ModelConfigResponse(config=self._find(request.name, context).config)
 
     def ModelStatistics(self, request: Any, context: Any) -> Any:  # noqa: N802
-        stats = [service_pb2.ModelStatistics(name=name, version="1") for name in self._models]
+        stats = [service_pb2.ModelStatistics(name=name, version="1") for name in list(self._models)]
         return service_pb2.ModelStatisticsResponse(model_stats=stats)
 
     def ModelInfer(self, request: Any, context: Any) -> Any:  # noqa: N802
