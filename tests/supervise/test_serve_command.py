@@ -24,6 +24,7 @@ import rfm_export
 import stand_in_triton
 from client_commands import Terminal
 from commands import EXIT_S, REPOSITORY, RFM, command, is_alive, nothing_left_behind
+from gateways import answers
 from in_process import rfm
 from paths import ROOT
 from rfm.config import ExportConfig
@@ -33,7 +34,7 @@ from rfm.serve.installation import ServerStartError, find_installation
 from rfm.serve.triton_server import Endpoints, TritonServer, short_spin
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_client.contract.process import MOST
-from servers import PATIENCE_S, children, model_processes, wait_for
+from servers import PATIENCE_S, Serving, children, model_processes, wait_for
 
 VIDEO = ROOT / "tests/videos/jaco_play_pick_up_green_cup.mp4"
 TRY = ["try", str(VIDEO), f"--repository={REPOSITORY}", f"--task={clip.TASK}"]
@@ -43,13 +44,6 @@ def executable(file: Path, content: str) -> Path:
     file.write_text(content)
     file.chmod(0o755)
     return file
-
-
-def answer_of(url: str) -> httpx.Response | None:
-    try:
-        return httpx.get(url)
-    except httpx.TransportError:
-        return None
 
 
 def environment(pid: int) -> set[str]:
@@ -71,16 +65,15 @@ def test_the_committed_repository_is_served_with_a_gateway_until_a_signal(
     (tmp_path / "server.yaml").write_text(f"server_url: http://[::1]/\nserver_port: {gateway}\n")
     words = [*command(REPOSITORY, endpoints), "--host=::1", f"--status-port={status}"]
     words += ["--config", str(tmp_path / "server.yaml")]
-    page = f"http://[::1]:{gateway}/"
+    page = f"http://[::1]:{gateway}"
     video = Trajectory(frames=clip.render()[::8], task=clip.TASK)
     samples = [ProgressSample(video), PreferenceSample(video, video)]
     with nothing_left_behind(), subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
         try:
-            wait_for(lambda: answer_of(f"http://[::1]:{status}/ready") or process.poll() is not None)
-            wait_for(lambda: httpx.get(f"http://[::1]:{status}/ready").json()["ready"])
-            wait_for(lambda: answer_of(page))
+            Serving(process, endpoints, f"http://[::1]:{status}", tmp_path).wait_ready()  # type: ignore[arg-type]
+            wait_for(lambda: answers(page))
             assert "<title>Robot video rewards</title>" in httpx.get(page).text
-            assert httpx.get(f"{page}health").json()["status"] == "healthy"
+            assert httpx.get(f"{page}/health").json()["status"] == "healthy"
             assert "nv_inference_count" in httpx.get(endpoints.metrics_url).text
             scores = []
             for url in (f"grpc://[::1]:{grpc}", f"http://[::1]:{http}"):
@@ -102,8 +95,8 @@ def test_the_committed_repository_is_served_with_a_gateway_until_a_signal(
             _, log = process.communicate(timeout=EXIT_S)
     assert process.returncode == 0
     assert f"at grpc://[::1]:{grpc}, http://[::1]:{http}, metrics at http://[::1]:{metrics}/metrics\n" in log
-    assert f"answers requests at {page}\n" in log
-    assert f"look at rewards in the browser: {page}\n" in log
+    assert f"answers requests at {page}/\n" in log
+    assert f"look at rewards in the browser: {page}/\n" in log
     assert not re.search(r"^I\d{4} ", log, re.MULTILINE)  # Triton's remarks
 
 

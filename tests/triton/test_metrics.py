@@ -23,14 +23,7 @@ from repositories import FAILING, FAILING_STEPS, make_repository
 from rfm.serve.installation import Installation, find_installation
 from rfm.triton_model.metrics import BUCKETS_S, PADDING_BUCKETS, SAMPLES_BUCKETS
 from rfm.triton_model.request import OUTCOMES, UNKNOWN_TYPE
-from rfm_client import (
-    InferenceFailedError,
-    InvalidSampleError,
-    ProgressSample,
-    RewardClient,
-    Sample,
-    Trajectory,
-)
+from rfm_client import InferenceFailedError, InvalidSampleError, ProgressSample, RewardClient, Trajectory
 from rfm_client.contract import wire
 from servers import RepositoryApi, Served, start_triton, wait_for
 from trajectories import random_trajectory
@@ -100,10 +93,6 @@ def client(served: Served, model: str) -> RewardClient:
     return RewardClient(served.url("grpc"), model=model, retry=False)
 
 
-def num_frames(samples: list[Sample]) -> int:
-    return sum(trajectory.num_frames for sample in samples for trajectory in sample.trajectories)
-
-
 @pytest.mark.slow
 def test_samples_are_counted_by_type_and_by_what_became_of_them_in_each_of_two_instances(served_too: Served) -> None:
     """Failures are counted, too: in a batch, then alone, as the client asks again."""
@@ -120,9 +109,10 @@ def test_samples_are_counted_by_type_and_by_what_became_of_them_in_each_of_two_i
     with pytest.raises(InvalidSampleError, match="sample_type"):
         infer(served_too.url("grpc"), TWICE, foreign, [wire.PROGRESS])
     scored = dict.fromkeys((f"{kind} scored" for kind in TYPES), 20.0)
+    num_frames = sum(trajectory.num_frames for sample in samples for trajectory in sample.trajectories)
     others = {"progress refused": 2, "unknown refused": 3, "progress failed": 1}
     after = scrape(served_too)
-    assert counted(after, before, TWICE) == {**scored, **others, "frames": num_frames(samples)}
+    assert counted(after, before, TWICE) == {**scored, **others, "frames": num_frames}
     each = [after.value("samples_total", instance=f"{TWICE}_0_{number}") for number in range(2)]
     assert sum(each) == after.value("samples_total", model=TWICE) == 66
     assert after.value("batch_samples_sum", model=TWICE) == 60
@@ -177,10 +167,7 @@ def test_a_model_that_is_loaded_again_counts_on(served_too: Served) -> None:
         api.unload(TWICE)
         api.wait_gone(TWICE)
         wait_for(shows(0))
-        assert counted(scrape(served_too, 0), before, TWICE) == {
-            "progress scored": 1,
-            "frames": 3,
-        }  # told before it went
+        assert counted(scrape(served_too, 0), before, TWICE) == {"progress scored": 1, "frames": 3}  # told before
         api.load(TWICE)
         asked.evaluate([sample])
         config = served_too.repository / TWICE / "config.pbtxt"
