@@ -16,7 +16,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -30,10 +30,15 @@ import odd_requests
 import rfm_export
 import rollout
 from callers import WIDTHS
+from engines import serve_config
 from faults import CALLERS, CHECKPOINT, FAULTS, TRITON, Row, site
 from paths import ROOT
+from rfm import published
 from rfm.config import ExportConfig
+from rfm.engine import Engine, Outcome
+from rfm_client import PreferenceSample, ProgressSample, Sample, Trajectory
 from servers import MODEL
+from trajectories import random_trajectory
 
 ENCODERS = ROOT / "model_repository" / "rfm_encoder" / "1"
 MOST_MIB_PER_MIN = 1e6 / 2**20  # largest growth of memory in a soak
@@ -49,11 +54,31 @@ def all_faults(folder: Path, arguments: argparse.Namespace) -> list[Row]:
     return rows
 
 
+def rollout_samples() -> list[Sample]:
+    """Embeddings and frames, several lengths, two types."""
+    random = np.random.default_rng(0)
+    samples: list[Sample] = []
+    for index in range(16):
+        count = 1 + index % 6
+        frames = random.integers(0, 256, (count, 48, 48, 3), np.uint8)
+        filmed = Trajectory(frames=frames, task=f"stack {index} cups")
+        for trajectory in (random_trajectory(index, count, *rollout.WIDTHS), filmed):
+            samples.append(PreferenceSample(trajectory, trajectory) if index % 4 == 3 else ProgressSample(trajectory))
+    return samples
+
+
+def answers(checkpoint: Path, samples: Sequence[Sample]) -> list[Outcome]:
+    """Return the checkpoint's answers without a server."""
+    serve = serve_config(rollout.WITH_ENCODERS)
+    loaded = published.read(checkpoint, image_encoder=serve.image_encoder, text_encoder=serve.text_encoder)
+    return Engine.of(loaded.checkpoint, encoders=loaded.encoders()).evaluate(samples)
+
+
 def take_turns(folder: Path, arguments: argparse.Namespace) -> list[Row]:
     """Alternate rollout and rollback under calls over gRPC and HTTP without retry. Each answer names its version."""
-    other, samples = rollout.other_checkpoint(folder / "other"), rollout.questions()
+    other, samples = rollout.other_checkpoint(folder / "other"), rollout_samples()
     checkpoints = {"1": rollout.WITH_ENCODERS.checkpoint, "2": other}
-    expected = {version: rollout.answers(checkpoint, samples) for version, checkpoint in checkpoints.items()}
+    expected = {version: answers(checkpoint, samples) for version, checkpoint in checkpoints.items()}
     rows = []
     with site(folder / "rollout", lambda repository: rollout.export(checkpoints["1"], repository, MODEL)) as served:
         rollout.export(other, served.folder / "model_repository", MODEL)

@@ -14,8 +14,7 @@ from typer.testing import CliRunner
 import toy_dataset
 from in_process import rfm_app, rfm_client_app
 from paths import ROOT
-from rfm_labels import evaluate_labels, open_dataset, read_outcomes
-from toy_world import TASKS
+from rfm_labels import evaluate_labels, read_outcomes
 
 GUIDE = ROOT / "docs" / "guides" / "choose_a_checkpoint.md"
 COMMAND = re.compile(r"^ {4}((?:python|rfm|rfm-client) .*demo_output/toy(?:.*\\\n)*.*)", re.MULTILINE)
@@ -60,19 +59,3 @@ def test_the_guide_s_commands_tell_the_trained_checkpoint_from_the_early_one(
     assert full.by_progress.auroc > early.by_progress.auroc + 0.2  # five times the training
     assert early.frames_per_s is not None
     assert full.frames_per_s is not None
-
-
-def test_the_toy_dataset_has_all_tasks_and_as_many_failures_as_successes(tmp_path: Path) -> None:
-    first, second = tmp_path / "first", tmp_path / "second"
-    for folder in (first, second):
-        toy_dataset.write(folder, clips=12)
-    outcomes = read_outcomes(str(first / "outcomes.csv"))
-    assert sum(outcomes.values()) == len(outcomes) / 2 == 6
-    episodes = open_dataset(first).episodes
-    assert [episode.index for episode in episodes] == list(outcomes)
-    assert {episode.task for episode in episodes} == {task.sentence() for task in TASKS}
-    assert [file.read_bytes() for file in sorted(first.iterdir())] == [
-        file.read_bytes() for file in sorted(second.iterdir())
-    ]
-    with pytest.raises(typer.BadParameter, match="expected a folder that does not exist"):
-        toy_dataset.write(first)

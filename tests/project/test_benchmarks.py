@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,22 +12,7 @@ from paths import ROOT
 sys.path.append(str(ROOT / "benchmarks"))
 
 import gpu
-from load import NUM_FILMED, Calls, Load, Measured, samples
 from real_size import FULL
-
-FILMED = Load(4, 0, (2, 2), frame_px=(8, 6))
-
-
-def test_no_frame_comes_twice_but_in_a_load_that_repeats_few_videos() -> None:
-    for load, expected in ((FILMED, 200), (replace(FILMED, repeated=True), 2 * NUM_FILMED)):
-        sample = samples(load, 0, 0)
-        made = [sample(index).trajectory.frames for index in range(100)]  # type: ignore[union-attr]
-        assert len({frame.tobytes() for frames in made for frame in frames}) == expected  # type: ignore[union-attr]
-
-
-def test_percentiles_are_those_of_all_processes() -> None:
-    measured = Measured.of([Calls([0.1] * 3, 0, 1.0), Calls([0.5], 2, 2.0)], together=2)
-    assert measured == Measured(samples_per_s=7.0, failed=2, p50_ms=100.0, p99_ms=pytest.approx(488.0), took_s=2.0)
 
 
 def test_results_of_parts_and_of_another_checkout_stay_and_are_judged(tmp_path: Path) -> None:

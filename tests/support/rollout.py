@@ -23,24 +23,18 @@ import goldens
 import rfm_export
 from callers import numbers
 from engines import serve_config
-from rfm import published
-from rfm.engine import Engine, Outcome
+from rfm.engine import Outcome
 from rfm_client import (
     AsyncRewardClient,
     DeadlineExceededError,
-    PreferenceSample,
-    ProgressSample,
     RewardError,
     Sample,
-    Trajectory,
 )
 from tolerances import TOLERANCE
-from trajectories import random_trajectory
 
 NAME = "rfm"
 WITH_ENCODERS = goldens.config("enc_c1_t1_disc10")
 WIDTHS = (48, 32)
-FRAME_PX = 48
 CALLERS = 8  # more would slow down the loading
 PAUSE_S = 0.2  # a control loop's step
 
@@ -90,27 +84,6 @@ def other_checkpoint(folder: Path, source: Path = WITH_ENCODERS.checkpoint) -> P
 
 def export(checkpoint: Path, repository: Path, name: str = NAME) -> int:
     return rfm_export.export(checkpoint, repository, serve_config(WITH_ENCODERS, name))
-
-
-def questions() -> list[Sample]:
-    """Embeddings and frames, several lengths, two types."""
-    random = np.random.default_rng(0)
-    samples: list[Sample] = []
-    for index in range(16):
-        count = 1 + index % 6
-        embedded = random_trajectory(index, count, *WIDTHS)
-        frames = random.integers(0, 256, (count, FRAME_PX, FRAME_PX, 3), np.uint8)
-        filmed = Trajectory(frames=frames, task=f"stack {index} cups")
-        for trajectory in (embedded, filmed):
-            samples.append(PreferenceSample(trajectory, trajectory) if index % 4 == 3 else ProgressSample(trajectory))
-    return samples
-
-
-def answers(checkpoint: Path, samples: Sequence[Sample]) -> list[Outcome]:
-    """Return the checkpoint's answers without a server."""
-    serve = serve_config(WITH_ENCODERS)
-    loaded = published.read(checkpoint, image_encoder=serve.image_encoder, text_encoder=serve.text_encoder)
-    return Engine.of(loaded.checkpoint, encoders=loaded.encoders()).evaluate(samples)
 
 
 def difference(left: object, right: object) -> float:
