@@ -49,7 +49,7 @@ _NO_CONNECTION = re.compile(  # gRPC's own messages: nothing was sent
 )
 _REASON = re.compile(r"(?:: |\[)((?:Connection|Domain name|Name|No route|Network)[\w ]+)\]?$")  # from libc or gRPC
 _PROXY_ALONE = "http2 header with status: 502"  # a proxy answered, but the server behind it did not
-_LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # server's or proxy's
+_LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # or a proxy's
 _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|{RESTRICTED}")
 _WRONG_SHAPE = re.compile(  # without the batch axis, which the caller did not add
     r"unexpected shape for input '(?P<name>\w+)'.*?Expected \[-1,(?P<expected>[^\]]*)\], got \[\d+,(?P<got>[^\]]*)\]"
