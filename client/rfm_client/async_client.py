@@ -143,7 +143,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def similarity(
         self, reference: Trajectory, other: Trajectory, **options: Unpack[CallOptions]
     ) -> SimilarityResult:
-        """Return the raw similarity score between ``other`` and ``reference``. Raises RewardError."""
+        """Return a raw score for how similar ``other`` is to ``reference``. Raises RewardError."""
         return cast(SimilarityResult, await self.score(SimilaritySample(reference, other), **options))
 
     async def curve(
@@ -173,7 +173,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         return rule.joined(cast("list[ProgressResult]", results))
 
     async def score(self, sample: Sample, **options: Unpack[CallOptions]) -> Result:
-        """Return the result for one sample of any type. Raises RewardError."""
+        """Return the result of one sample of any type. Raises RewardError."""
         return await self._scorer.result(sample, self._call(options))
 
     @overload
@@ -303,7 +303,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         return ""
 
     def _call(self, options: CallOptions) -> Call:
-        """Start a call now. Raises TypeError for an unknown option."""
+        """Return a call that begins now. Raises TypeError for an unknown option."""
         others: dict[str, Any] = {**options}
         return Call(self._deadline(others.pop("timeout_s", None)), **others)
 

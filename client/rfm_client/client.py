@@ -60,7 +60,7 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         return self._loop.wait(self._client.curve(trajectory, sampling, **options))
 
     def similarity(self, reference: Trajectory, other: Trajectory, **options: Unpack[CallOptions]) -> SimilarityResult:
-        """Return the raw similarity score between ``other`` and ``reference``. Raises RewardError."""
+        """Return a raw score for how similar ``other`` is to ``reference``. Raises RewardError."""
         return self._loop.wait(self._client.similarity(reference, other, **options))
 
     @overload

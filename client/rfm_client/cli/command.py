@@ -151,7 +151,7 @@ class CommandGroup(TyperGroup):
     """Lists the commands before the options in the help."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words before the command. An error about a misplaced command option says where the option belongs."""
+        """Parse the words before the command. An error about a command's option says where to put the option."""
         try:
             return super().parse_args(ctx, args)
         except UsageError as error:
@@ -183,7 +183,7 @@ class Commands(CommandGroup):
 
 
 def exit_code(error: BaseException) -> ExitCode:
-    """Return the exit code for a command that fails with this error."""
+    """Return the exit code of a command that fails with this error."""
     return next((code for kind, code in _ERROR_CODES.items() if isinstance(error, kind)), ExitCode.FAILED)
 
 
@@ -260,7 +260,7 @@ def _parameter(setting: Setting) -> inspect.Parameter:
 
 
 def _key(setting: Setting) -> str:
-    """Return the name of the parameter from ``_parameter``, which no command's own parameter uses."""
+    """Return the name of the parameter from ``_parameter``, which no command's own parameter has."""
     return f"{setting.prefix}{setting.name}_option".replace("-", "_")
 
 

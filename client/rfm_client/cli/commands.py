@@ -229,7 +229,7 @@ def sample(
     failures = [outcome for outcome in outcomes if isinstance(outcome, RewardError)]
     for index, outcome in enumerate(outcomes):
         if isinstance(outcome, RewardError):
-            report(f"samples[{index}]: {with_remedy(outcome, '')}")  # the remedy for videos does not apply: --num-frames decides
+            report(f"samples[{index}]: {with_remedy(outcome, '')}")  # not the videos' remedy: --num-frames decides
     rows = [(f"{index}", outcome) for index, outcome in enumerate(outcomes) if not isinstance(outcome, RewardError)]
     if output.prints_tables and rows:
         of = "frames" if are_frames(samples) else "embeddings"

@@ -76,7 +76,7 @@ class Comparison:
         return sorted(self._numbers, key=lambda index: cast(int, self.ranks[index]))
 
     def tables(self) -> list[str]:
-        """Return a table with the sources, best first, a table with the pairs, and without a ranking a legend."""
+        """Return a table of sources, best first, a table of pairs, and without a ranking a legend."""
         columns = ("video", "rank", "P(wins)", "final progress", "final success", "frames")
         pairs = ("first", "second", "P(first wins)", "asked second first", "mean", "orders")
         return [

@@ -37,7 +37,7 @@ _ENDINGS = {"json": (".json",), "plot": _PICTURES, "strips": _PICTURES, "rrd": (
 
 
 def check_folder(name: str, folder: Path) -> None:
-    """Raise ConfigError about the setting ``name`` if the folder cannot take a new file."""
+    """Raise ConfigError about the setting ``name`` if no file can be created in the folder."""
     if not folder.is_dir():
         raise ConfigError.at(name, f"a folder at {folder}", f"none: mkdir -p {shlex.quote(str(folder))}")
     if not os.access(folder, os.W_OK):

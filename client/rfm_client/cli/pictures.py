@@ -39,7 +39,7 @@ _LETTER = 0.08
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One trajectory's part of a plot: T scored frames, and a strip with S frames, H x W pixels.
+    """One trajectory's part of a plot: T scored frames, and a strip of S frames, H x W pixels.
 
     positions: float64 [T], scored frames on the time axis
     unit: ``s`` or ``frame``, for the positions

@@ -193,7 +193,7 @@ class SourceScorer:
 
 
 def exit_code_of_outcomes(outcomes: Sequence[Outcome]) -> ExitCode:
-    """Return the exit code for a command with these outcomes."""
+    """Return the exit code of a command with these outcomes."""
     failures = [outcome for outcome in outcomes if isinstance(outcome, Failed)]
     codes = {exit_code(failure.error) for failure in failures if failure.is_server_gone}
     if codes:

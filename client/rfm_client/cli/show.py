@@ -64,7 +64,7 @@ class Table:
     """A plain table. Headers wrap to fit their columns.
 
     columns: headers
-    cells: all cells in each column, or sample cells with the same width
+    cells: all cells in each column, or stand-ins of the same width
     names: how many leading columns hold names and paths, which are shortened to fit the terminal; FILE_WIDTH applies to
         a file or a pipe
     """

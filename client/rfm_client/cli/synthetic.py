@@ -3,7 +3,7 @@
 
 The file follows perf_analyzer's ``--input-data`` format (its docs/input_data.md). ``data`` has an entry for each
 request. Each tensor has ``content`` in row-major order, and ``shape`` without the batch axis, which perf_analyzer adds.
-Numbers are base64 from their little-endian bytes.
+Numbers are base64 of their little-endian bytes.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Describe a served checkpoint. The export writes the JSON to config.pbtxt; client and server read it."""
+"""The description of a served checkpoint, which the export writes as JSON to config.pbtxt for client and server."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class FrameSize:
         return f"{self.rule} {'x'.join(map(str, self.edges_px))}"
 
     def fitted(self, height: int, width: int) -> tuple[int, int]:
-        """Return (height, width) to shrink such frames to; never larger, because the server enlarges frames."""
+        """Return the (height, width) to shrink a frame to; never larger, because the server enlarges frames."""
         if self.rule == "exact":
             return min(height, self.edges_px[0]), min(width, self.edges_px[1])
         (px,) = self.edges_px
@@ -109,7 +109,7 @@ class Description(Origin):
     uses_graphs: True if the predictor can score small batches with CUDA graphs
     is_large: True if float32 on the CPU is slow; exports are verified in the serving dtype, on a GPU with enough memory
     weights_digest: 16 hex digits, digest of the exported weights; None: not exported
-    settings_digest: 16 hex digits, digest over everything else that decides scores: files beside the weights
+    settings_digest: 16 hex digits, digest of everything else that decides scores: files beside the weights
         (configuration, tokenizer, image processor), dtype, device kind; None: not exported
     """
 

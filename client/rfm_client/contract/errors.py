@@ -67,7 +67,7 @@ class LocatedError(Exception):
 
 
 def clear_variables(error: BaseException | None) -> None:
-    """Clear the local variables in an error's traceback, and in the tracebacks of its causes.
+    """Clear the local variables of functions that an error and its causes have left.
 
     A variable that holds an error from the same function forms a reference cycle. The request's arrays would stay in
     memory until Python's cycle collector runs.

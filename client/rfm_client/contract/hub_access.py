@@ -17,7 +17,7 @@ _MISSING = (HTTPStatus.UNAUTHORIZED, HTTPStatus.NOT_FOUND)  # the Hub hides priv
 
 
 class HubError(OSError):
-    """Neither the Hub nor its cache delivered; the message says why."""
+    """Fetching from the Hub and its cache failed; the message says why."""
 
 
 @contextmanager
@@ -37,7 +37,7 @@ def hub_errors() -> Iterator[None]:
 def cached_snapshot(
     repo_id: str, kind: str = "model", revision: str | None = None, patterns: list[str] | None = None
 ) -> Path:
-    """Return the folder with a revision in the Hub's cache, fetched if the Hub answers.
+    """Return the folder of a revision in the Hub's cache, fetched if the Hub answers.
 
     kind: ``model`` or ``dataset``
     patterns: file names to fetch; None: all files

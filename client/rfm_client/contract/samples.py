@@ -20,7 +20,7 @@ from rfm_client.contract.errors import InvalidSampleError
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
 UInt8Array: TypeAlias = npt.NDArray[np.uint8]
-NamedFrame: TypeAlias = tuple[bytes, npt.NDArray[Any]]  # a frame's digest, and what a server has for the frame
+NamedFrame: TypeAlias = tuple[bytes, npt.NDArray[Any]]  # a frame's digest, and what a server keeps of the frame
 
 MIN_FRAME_STEPS = 2  # a prefix sampled to a single frame is no trajectory
 MOST_VIEWS = 2  # besides the frames
@@ -184,7 +184,7 @@ Sample: TypeAlias = ProgressSample | PreferenceSample | SimilaritySample
 class EncoderSample:
     """One sample's trajectories, for an encoder.
 
-    The encoder reads frames and the first trajectory's task. It returns trajectories with embeddings for both.
+    The encoder reads frames and the first trajectory's task. It returns trajectories with embeddings of both.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -249,7 +249,7 @@ def float_frames_to_uint8(frames: npt.ArrayLike) -> UInt8Array:
 def as_array(values: Any) -> npt.NDArray[Any]:
     """Return the values as an array; torch tensors too, on a GPU or with a gradient, bfloat16 as float32.
 
-    Raises ValueError for rows with unequal lengths, InvalidSampleError for a Pillow picture whose numbers are not RGB.
+    Raises ValueError for rows of unequal length, InvalidSampleError for a Pillow picture whose numbers are not RGB.
     """
     if isinstance(values, (list, tuple)) and values and (hasattr(values[0], "detach") or hasattr(values[0], "getexif")):
         values = [as_array(each) for each in values]
@@ -274,7 +274,7 @@ def _checked_frames(frames: Any) -> UInt8Array:
         array = as_array(frames)
     except InvalidSampleError as error:
         raise error.inside("frames") from None
-    except ValueError:  # lists with unequal lengths
+    except ValueError:  # lists of unequal length
         raise InvalidSampleError.at("frames", "uint8 [T, H, W, 3]", "frames of unequal size") from None
     got = f"{array.dtype} {list(array.shape)}"
     if array.dtype != np.uint8:
@@ -300,7 +300,7 @@ def _checked_floats(where: str, values: Any, axes: tuple[str, ...]) -> Float32Ar
     expected = f"float32 [{', '.join(axes)}]"
     try:
         array = as_array(values)
-    except ValueError:  # lists with unequal lengths
+    except ValueError:  # lists of unequal length
         raise InvalidSampleError.at(where, expected, "rows of unequal length") from None
     if array.dtype.kind not in "fiu" or array.ndim != len(axes):
         raise InvalidSampleError.at(where, expected, f"{array.dtype} {list(array.shape)}")

@@ -23,7 +23,7 @@ _NAMES: dict[Any, str] = {types.NoneType: "null", Path: "str", Texts: "list of s
 
 
 class ConfigError(InvalidValueError):
-    """An invalid setting, or two settings that conflict.
+    """An invalid setting, or two settings that do not fit together.
 
     where: the setting's name
     other: the second setting's name; empty: none
@@ -53,11 +53,11 @@ class ConfigError(InvalidValueError):
 
 @dataclass(frozen=True)
 class Setting:
-    """One field in a ``Settings``.
+    """One field of a ``Settings``.
 
     default: ``MISSING``: the setting is required
     title: heading in a command's help
-    least, most: bounds for a number
+    least, most: bounds of a number
     flag, prefix: command-line option, and the prefix for all options; flag None: derived from ``name``
     metavar: placeholder for the value in a command's help; None: derived from ``kind``
     variable: environment variable for the value
@@ -116,7 +116,7 @@ class Setting:
 
     @property
     def bounds(self) -> str:
-        """Bounds for a number, in words; empty without bounds."""
+        """Bounds of a number, in words; empty without bounds."""
         if self.least is None:
             return ""
         has_most = self.most is not None and self.most < _UNBOUNDED

@@ -110,7 +110,7 @@ class StepScorer:
     def _parts(self, windows: Sequence[Window], limit: int) -> Iterator[list[int]]:
         """Yield window indices for each request.
 
-        A request has frames in one size, for one server, at most ``limit`` windows, and at most MAX_NEW_BYTES unless a
+        A request has frames of one size, for one server, at most ``limit`` windows, and at most MAX_NEW_BYTES unless a
         single window has more.
         """
         servers = [self._server(window) for window in windows]

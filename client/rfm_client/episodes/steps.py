@@ -36,7 +36,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Frames in one size and a task, to be scored for progress. Raises InvalidSampleError for an invalid task.
+    """Frames of one size and a task, to be scored for progress. Raises InvalidSampleError for an invalid task.
 
     episode: identifies the episode; all windows in an episode go to one server
     """

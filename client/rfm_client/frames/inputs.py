@@ -64,7 +64,7 @@ def load_trajectory(
     views: files or URLs with further cameras' frames, cut to the same part
     goal: picture file, used as stored, upright by its EXIF data. Needs Pillow
 
-    Raises InvalidSampleError, also for arrays with Python objects, because reading them runs code, and for a video with
+    Raises InvalidSampleError, also for arrays of Python objects, because reading them runs code, and for a video with
     several LeRobot v3.0 episodes, unless ``start_s`` and ``end_s`` select a part.
     """
     part: dict[str, Any] = {"fps": fps, "start_s": start_s, "end_s": end_s}

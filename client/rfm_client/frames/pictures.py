@@ -42,7 +42,7 @@ class FrameFileError(InvalidValueError):
 
 
 class Picture:
-    """A picture with 8-bit colours. Needs Pillow.
+    """A picture of 8-bit colours. Needs Pillow.
 
     stored: file content, file path, or a picture that Pillow has opened
     """
@@ -86,7 +86,7 @@ class Picture:
 
 
 def opened_picture(picture: bytes | Path) -> Any:
-    """Open a picture with 8-bit colours, or its file, and read only the header. Raises FrameFileError."""
+    """Open a picture of 8-bit colours, or its file, and read only the header. Raises FrameFileError."""
     Picture.decoder()
     from PIL import Image, UnidentifiedImageError
 

@@ -28,7 +28,7 @@ DAMAGED = "one that the decoder marks, or is made from such a one"
 DOWNLOAD = "download it again"
 _HEADLESS = ("an HEVC video that begins with a key frame (cut it there: ffmpeg -ss SECONDS -i IN OUT)", "another frame")
 
-_NO_MATRIX, _BT601, _BT2020 = 0, 5, 9  # from YUV to RGB, with ITU-T H.273 numbers
+_NO_MATRIX, _BT601, _BT2020 = 0, 5, 9  # from YUV to RGB, as numbered by ITU-T H.273
 _MATRICES = (1, 4, _BT601, 7, _BT2020)  # known to libswscale, which replaces others by BT.601
 _SAME_MATRIX = {6: _BT601, 10: _BT2020}  # other numbers for the same matrix
 _BITS = 8  # most bits in a grey video's only channel; depth maps have more

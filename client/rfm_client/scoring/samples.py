@@ -125,7 +125,7 @@ class SampleScorer:
         self._asking = asyncio.Lock()
 
     async def result(self, sample: Sample, call: Call) -> Result:
-        """Return the result for one sample. Raises RewardError."""
+        """Return the result of one sample. Raises RewardError."""
         fit = await self._fitted(sample, call)
         (result,) = results_of(list(await self._request(model_of(fit.sample, self._model), [fit.sample], call)))
         await self._check_lengths([fit.sample], call.deadline)

@@ -10,9 +10,9 @@ only with each other:
 
 - ``second_frames``, for pairs whose trajectories differ in frame size. ``frames`` then has the first trajectories,
   ``second_frames`` the second, and P counts the positions in both.
-- ``frame_digests``, for a model that caches frame features: one digest for each frame P. ``frames`` then has the pixels
-  that the model may lack, in any order and in any sample's row; zeros may lie between them. The model refuses a
-  digest that it does not know, and the caller sends the request again with all pixels.
+- ``frame_digests``, for a model that caches frame features: one digest for each of the P frames. ``frames`` then has
+  the pixels that the model may lack, in any order and in any sample's row; zeros may lie between them. The model
+  refuses a digest that it does not know, and the caller sends the request again with all pixels.
 - ``left_frames`` and ``right_frames``, for a model that reads wrist views: as many frames as ``frames``.
 - ``goal``, for such a model: a picture that shows the finished task.
 """

@@ -43,9 +43,9 @@ from rfm_client.contract.wire.specs import (
 )
 
 Decoded = TypeVar("Decoded")
-Row: TypeAlias = dict[str, npt.NDArray[Any]]  # tensors for one sample
+Row: TypeAlias = dict[str, npt.NDArray[Any]]  # tensors of one sample
 Known: TypeAlias = Mapping[Any, npt.NDArray[Any]]  # pixels or embeddings by frame digest
-Kept: TypeAlias = Callable[[Iterable[bytes]], Known]  # returns what a server keeps for these frames
+Kept: TypeAlias = Callable[[Iterable[bytes]], Known]  # returns what a server keeps of these frames
 
 _SAMPLE_TYPES = {
     ProgressSample: SampleType.PROGRESS,
@@ -57,7 +57,7 @@ _SAMPLE_TYPES = {
 def encode_samples(samples: Sequence[Sample]) -> Tensors:
     """Return one request. Apart from time, all first trajectories must share one shape, and so must all second ones.
 
-    All samples need views and goals with the same shapes, or none.
+    The samples must agree on which views and goal they have, and on the shapes.
     """
     tensors: Tensors = {
         SAMPLE_TYPE: np.array([[_SAMPLE_TYPES[type(sample)]] for sample in samples], np.uint8),
@@ -90,7 +90,7 @@ def decode_samples(tensors: Mapping[str, npt.NDArray[Any]], kept: Kept | None = 
 
 
 def encode_frames(trajectory: Trajectory) -> Tensors:
-    """Return an encoder request for one trajectory with raw frames. The encoder refuses what it does not read."""
+    """Return an encoder request for one trajectory of raw frames. The encoder refuses what it does not read."""
     tensors = encode_samples([ProgressSample(trajectory)])
     return {name: tensor for name, tensor in tensors.items() if name not in (SAMPLE_TYPE, FRAME_STEPS)}
 
@@ -118,7 +118,7 @@ def encode_refs(videos: Sequence[Sequence[bytes]], tasks: Sequence[str], sent: S
     """Return one progress request for videos whose frames are named by their digests.
 
     videos, tasks: frame digests and a task for each video
-    sent: frames that the model may lack, uint8 [H, W, 3] in one size; empty: it has all frames
+    sent: frames that the model may lack, uint8 [H, W, 3] of one size; empty: it has all frames
     """
     count = len(videos)
     num_rows = -(-len(sent) // count)

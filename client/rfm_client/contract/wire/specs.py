@@ -34,7 +34,7 @@ def encoder_name(model: str) -> str:
 
 
 def frames_name(model: str) -> str:
-    """Return the name for the model that scores raw frames, beside ``model`` for embeddings."""
+    """Return the name of the model that scores raw frames, beside ``model`` for embeddings."""
     return f"{model}_frames"
 
 
@@ -69,7 +69,7 @@ VARIABLE = -1  # a dimension that differs between requests
 
 
 class SampleType(IntEnum):
-    """Values for the ``sample_type`` input."""
+    """Values of the ``sample_type`` input."""
 
     PROGRESS = 0
     PREFERENCE = 1
@@ -78,7 +78,7 @@ class SampleType(IntEnum):
 
 @dataclass(frozen=True)
 class TensorSpec:
-    """Name, element type and dimensions (without the batch axis) for one input or output.
+    """Name, element type and dimensions (without the batch axis) of one input or output.
 
     ragged: True if requests with different variable dimensions may share a batch
     optional: True if a request may omit it; requests with and without it share no batch
@@ -113,13 +113,13 @@ def frame_digest(frame: UInt8Array) -> bytes:
 
 
 def embedding_inputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
-    """Return the inputs for a model that scores embeddings with widths D = video_dim and Dt = text_dim."""
+    """Return the inputs of a model that scores embeddings of widths D = video_dim and Dt = text_dim."""
     video = TensorSpec(VIDEO_EMBEDDINGS, "FP32", (VARIABLE, video_dim), ragged=True)
     return (*_QUESTION_SPECS, video, TensorSpec(TEXT_EMBEDDING, "FP32", (text_dim,)))
 
 
 def frame_inputs(*, by_digest: bool = False, with_views: bool = False) -> tuple[TensorSpec, ...]:
-    """Return the inputs for a model that scores raw frames.
+    """Return the inputs of a model that scores raw frames.
 
     by_digest: with frame digests
     with_views: with further cameras' frames, and a goal
@@ -144,7 +144,7 @@ def encoder_outputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
 def score_outputs(progress_bins: int | None, more: Collection[str] = ()) -> tuple[TensorSpec, ...]:
     """Return a reward model's outputs.
 
-    progress_bins: K for a discrete checkpoint; None: continuous
+    progress_bins: K of a discrete checkpoint; None: continuous
     more: frame scores beyond those that every model gives and those for progress bins
     """
     of_every_model = [name for name, score in FRAME_SCORES.items() if score.asked == "always"]
@@ -160,7 +160,7 @@ def score_outputs(progress_bins: int | None, more: Collection[str] = ()) -> tupl
 
 
 def num_positions(inputs: Mapping[str, npt.NDArray[Any]]) -> int:
-    """Return P, the frame positions in one request, summed over all its arrays."""
+    """Return P, the number of frame positions in one request, over all its arrays."""
     if FRAME_DIGESTS in inputs:
         return int(inputs[FRAME_DIGESTS].shape[1])
     return sum(int(inputs[name].shape[1]) for name in (FRAMES, SECOND_FRAMES, VIDEO_EMBEDDINGS) if name in inputs)
@@ -169,7 +169,7 @@ def num_positions(inputs: Mapping[str, npt.NDArray[Any]]) -> int:
 def pad_stack(
     rows: Sequence[Sequence[npt.NDArray[Any]]], length: int | None = None, *, fill: float = 0
 ) -> npt.NDArray[Any]:
-    """Return [B, length, ...] from B rows; a row joins arrays [N, ...] with one dtype and is padded with ``fill``.
+    """Return [B, length, ...] from B rows; a row joins arrays [N, ...] of one dtype and is padded with ``fill``.
 
     length: None: the longest row's length
     """
