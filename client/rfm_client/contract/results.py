@@ -45,7 +45,7 @@ class Score:
     is_per_bin: [T, K], and neither in JSON nor in labels; else [T]
     mark: what True says about a frame, as a clause; empty: numbers, not marks
     bounds: smallest and largest value; None: no bound
-    unit: unit for the values, such as ``s``; empty: none
+    unit: of the values, such as ``s``; empty: none
     higher_is_better: False: lower values are better
     skips_frames: its models answer about some frames only: this score and progress are NaN at the others
     is_newer: exports without it exist in the same family, so a served model may gain it
@@ -91,7 +91,7 @@ class FrameScores:
     remaining_s: float32 [T], RynnValue's seconds from each frame until the task is done
     relative_s: float32 [T], RynnValue's seconds from the previous frame, negative where the task went backwards; 0 at
         the first frame
-    entropy: float32 [T], entropy in nats behind ``remaining_s``; larger: less sure
+    entropy: float32 [T], entropy in nats of the probabilities behind ``remaining_s``; larger: less sure
     hop: float32 [T], Robo-Dopamine's change at each compared frame; NaN: not compared. Modes incremental and benchmark:
         the closed share of what remained or, negative, the lost share of what was reached. Other modes: the difference
         in progress

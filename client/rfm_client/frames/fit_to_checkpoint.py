@@ -77,7 +77,7 @@ def snapshot(sample: Sample) -> Sample:
 
 
 def fitted(sample: Sample, max_frames: int | None, frame_size: FrameSize | None) -> FittedSample:
-    """Return the sample with at most ``max_frames`` frames per trajectory, at most ``frame_size`` large.
+    """Return the sample with at most ``max_frames`` frames per trajectory, of at most ``frame_size``.
 
     max_frames: thin out frames as in training (``sampling.thinned``), but not in dense mode, where the server
         samples each prefix; None: any number

@@ -112,7 +112,7 @@ _EMBEDDINGS = (wire.VIDEO_EMBEDDINGS, wire.TEXT_EMBEDDING)
 class SampleScorer:
     """Scores samples on a client's servers, in one event loop.
 
-    model: the model's name for embeddings
+    model: name of the model for embeddings
     """
 
     def __init__(self, model: str, servers: Servers, concurrency: ConcurrencyLimiter) -> None:

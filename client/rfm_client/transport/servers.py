@@ -237,7 +237,7 @@ class Servers:
                 self._leave_out(server, model, error)
                 failed = failures.get(server)
                 if failed is not None and left_s < deadline.timeout_s / 2:
-                    raise failed from failed.__cause__  # this took most of the time
+                    raise failed from failed.__cause__  # this failure took most of the time
                 raise deadline.exceeded(error.server or server.transport.url) from error
             except (AccessDeniedError, InferenceFailedError, ModelNotFoundError) as error:
                 refusals[server] = error

@@ -32,7 +32,7 @@ from rfm_client.transport.threads import off_loop
 FOLDER = Path("/dev/shm")
 MIN_SHARED_BYTES = 64 * 2**10  # smaller inputs travel faster in the request itself
 MIN_REGION_BYTES = 2**20
-CLOSE_TIMEOUT_S = 2.0  # for the server to unmap all regions, even those still in use
+CLOSE_TIMEOUT_S = 2.0  # for the server to unmap all regions, which may still be in use
 IN_USE_PAUSE_S = 0.02  # between tries to unmap a region that a request still uses
 
 logger = logging.getLogger("rfm_client")

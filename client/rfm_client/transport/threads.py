@@ -62,7 +62,7 @@ class AsyncClosing:
 async def off_loop(
     num_bytes: int | None, work: Callable[Arguments, Returned], *arguments: Arguments.args, **options: Arguments.kwargs
 ) -> Returned:
-    """Return what ``work`` returns; it handles ``num_bytes``. From MIN_BYTES, or for None, it runs in a thread."""
+    """Return the result of ``work``, which handles ``num_bytes``. From MIN_BYTES, or for None, it runs in a thread."""
     if num_bytes is not None and num_bytes < MIN_BYTES:
         return work(*arguments, **options)
     return await asyncio.to_thread(work, *arguments, **options)
