@@ -78,7 +78,7 @@ __all__ = [
     "load_trajectory",
 ]
 
-_LATER = {  # imported at first use, since servers need the contract alone
+_LATER = {  # imported at first use, because servers need only the contract
     "AsyncRewardClient": "async_client",
     "RewardClient": "client",
     "as_trajectory": "frames.inputs",
@@ -86,7 +86,7 @@ _LATER = {  # imported at first use, since servers need the contract alone
 }
 
 
-if not typing.TYPE_CHECKING:  # a type checker would take any name
+if not typing.TYPE_CHECKING:  # otherwise a type checker would accept any name
 
     def __getattr__(name: str) -> object:
         if name in ("episodes", "frames", "options"):

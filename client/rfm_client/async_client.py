@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""AsyncRewardClient: asyncio client of served reward models, which RewardClient runs in a thread; options of both."""
+"""AsyncRewardClient: asyncio client for served reward models (RewardClient runs it in a thread); options for both."""
 
 from __future__ import annotations
 
@@ -48,26 +48,26 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 DEFAULT_TIMEOUT_S = 60.0
-DEFAULT_IN_FLIGHT = 128  # twice the usual batch: the next gathers while a batch is scored
+DEFAULT_IN_FLIGHT = 128  # twice the usual batch: the next batch fills up while one is scored
 
 
 @dataclass(eq=False, repr=False)
 class ClientOptions:
-    """Options of RewardClient and AsyncRewardClient, which do not change later.
+    """Options for RewardClient and AsyncRewardClient, fixed once the client exists.
 
     urls: one or several ``grpc://host:8001`` or ``http://host:8000``, with TLS ``grpcs://`` or ``https://``. The least
-        busy server gets the next request; an episode stays on one server, which keeps frame features. A server is left
-        out after a failure until it is ready again
+        busy server gets the next request; an episode stays on one server, which caches frame features. A failed server
+        gets no requests until it is ready again
     model: name used at export; raw frames go to ``<model>_frames``
     timeout_s: time limit for a call with all retries; at most 1e9
     retry: True: within the time limit, retry requests while a server is down, restarting or full
-    max_in_flight: open requests at a time, with at most 256 MiB together; further requests wait
-    shared_memory: True: large inputs go through shared memory, if client and server run on one host
-    ca_file: certificate authorities (PEM) to trust; None: the system's, over gRPC its built-in list
+    max_in_flight: how many requests may be open at once, with at most 256 MiB together; further requests wait
+    shared_memory: True: send large inputs through shared memory if client and server run on one host
+    ca_file: certificate authorities (PEM) to trust; None: the system's, or over gRPC its built-in list
     client_certificate, client_key: files (PEM) to identify this client (mutual TLS); both or neither
-    headers: sent with each request, over gRPC as metadata
-    api_key: sent with each request as ``Authorization: Bearer KEY``
-    transports: used in place of connections to ``urls``, for tests and unusual networks
+    headers: sent with every request, over gRPC as metadata
+    api_key: sent with every request as ``Authorization: Bearer KEY``
+    transports: replace connections to ``urls``, for tests and unusual networks
 
     Raises ValueError.
     """
@@ -87,21 +87,21 @@ class ClientOptions:
     transports: Sequence[Transport] | None = None
 
     def __post_init__(self) -> None:
-        """Make the client of these options."""
+        """Build the client from these options."""
         raise NotImplementedError
 
 
-ClientOptions.__init__.__doc__ = ClientOptions.__doc__  # so that help() of the clients shows it
+ClientOptions.__init__.__doc__ = ClientOptions.__doc__  # so that help() on the clients shows it
 
 
 READY_POLL_S = 0.2
-PREFIXES_AT_A_TIME = 64  # of a trajectory, in memory
+PREFIXES_AT_A_TIME = 64  # how many prefixes to hold in memory
 
 
 class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     """Client for one or several servers with the same checkpoint, in one event loop.
 
-    ``help(AsyncRewardClient.__init__)`` describes the options. Do not change arrays in a sample while you await the
+    ``help(AsyncRewardClient.__init__)`` describes the options. Do not change a sample's arrays while you await the
     call: a queued request reads them late.
     """
 
@@ -117,7 +117,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         self._scorer = SampleScorer(self.model, self._servers, ConcurrencyLimiter(self.max_in_flight))
         self._steps = StepScorer(self.model, self._scorer, len(self._servers))
         self._is_closed = False
-        self._loop: asyncio.AbstractEventLoop | None = None  # of the first call
+        self._loop: asyncio.AbstractEventLoop | None = None  # set by the first call
 
     async def progress(
         self, trajectory: Trajectory, *, frame_steps: int = 0, **options: Unpack[CallOptions]
@@ -130,8 +130,8 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     ) -> PreferenceResult:
         """Return the probability that ``first`` does the task better. Raises RewardError.
 
-        both_orders: True: ask the other order, too, since answers may depend on the order; ``preference`` is the mean,
-            and if the orders disagree, ``verdict`` is None. Recommended for labels
+        both_orders: True: also ask in the other order, since answers may depend on the order; ``preference`` is the
+            mean, and if the orders disagree, ``verdict`` is None. Recommended for labels
         """
         sample = PreferenceSample(first, second)
         if not both_orders:
@@ -143,18 +143,19 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def similarity(
         self, reference: Trajectory, other: Trajectory, **options: Unpack[CallOptions]
     ) -> SimilarityResult:
-        """Return the raw similarity score of ``other`` to ``reference``. Raises RewardError."""
+        """Return a raw score for how similar ``other`` is to ``reference``. Raises RewardError."""
         return cast(SimilarityResult, await self.score(SimilaritySample(reference, other), **options))
 
     async def curve(
         self, trajectory: Trajectory, sampling: Sampling | None = None, **options: Unpack[CallOptions]
     ) -> ProgressResult:
-        """Return the scores of each frame, as at the moment when it was the newest: on the frames up to it.
+        """Score every frame as if it were the newest: from that frame and the frames before it.
 
-        sampling: the frames that the model sees of each prefix; None: as in the checkpoint's training
-        options: of each of several calls, since the prefixes of a long trajectory do not fit in memory together
+        sampling: which frames the model sees from a prefix; None: as in the checkpoint's training
+        options: apply to each underlying call; several are needed because the prefixes of a long trajectory exceed
+            memory
 
-        Raises RewardError; ValueError if neither ``sampling`` nor the checkpoint says how many frames to show, and for
+        Raises RewardError; ValueError if neither ``sampling`` nor the checkpoint gives a frame count, and for
         ``subsample``.
         """
         require("subsample", not options.get("subsample"), "False: the sampling rule chooses the frames", True)
@@ -164,7 +165,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         samples, results = rule.samples(trajectory), list[Result]()
         if trajectory.frames is not None:
             self._scorer.tell_of_blank(trajectory.frames)
-        # in a thread, since copies of many frames would block the event loop
+        # in a thread, because copying many frames would block the event loop
         while part := await asyncio.to_thread(lambda: list(itertools.islice(samples, PREFIXES_AT_A_TIME))):
             call = self._call(options)
             call.checks_blank = False  # a prefix may repeat the first frame
@@ -186,9 +187,9 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def evaluate(
         self, samples: Iterable[Sample], *, return_errors: bool = False, **options: Unpack[CallOptions]
     ) -> list[Result] | list[Result | RewardError]:
-        """Score any number and mix of samples; return results in order.
+        """Score samples in any number and mix; return results in order.
 
-        return_errors: True: the error of a failed sample stands in its result's place; False: raise the first error,
+        return_errors: True: return a failed sample's error in place of a result; False: raise the first error,
             as ``samples[3].num_frames: expected X, got Y``
         """
         samples = list(samples)
@@ -196,19 +197,19 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         return outcomes if return_errors else results_of(outcomes, "samples[{}]" if len(samples) > 1 else "")
 
     def episode(self, task: str, *, env: int | None = None, **options: Unpack[StepKeywords]) -> AsyncEpisode:
-        """Return an episode to score step by step. A step sends only the new frame, if the server keeps features.
+        """Return an episode to score step by step. A step sends only the new frame if the server caches features.
 
-        env: index of the environment, shown in errors as ``envs[3]``; None: the only one
-        options: fields of EpisodeOptions. Raises ValueError for contradictory options
+        env: environment index, shown in errors as ``envs[3]``; None: the only one
+        options: EpisodeOptions fields. Raises ValueError for contradictory options
         """
         where = "" if env is None else f"envs[{checked_count('env', env, least=0)}]"
         steps = Steps(task, EpisodeOptions(**options), where)
         return AsyncEpisode(AsyncEpisodes(self._steps, self._call, [steps]))
 
     def episodes(self, num: int, task: str | Sequence[str], **options: Unpack[StepKeywords]) -> AsyncEpisodes:
-        """Return ``num`` parallel episodes, as in vectorised environments. A step needs as few requests as possible.
+        """Return ``num`` parallel episodes, as in vectorised environments. A step sends as few requests as possible.
 
-        task: a sentence for all episodes, or a sentence for each
+        task: one sentence for all episodes, or one per episode
         options: as in ``episode``
         """
         tasks = [task] * num if isinstance(task, str) else list(task)
@@ -219,7 +220,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         return AsyncEpisodes(self._steps, self._call, steps)
 
     async def score_steps(self, asked: Sequence[Asked]) -> list[StepScore]:
-        """Score episodes at their newest steps, in as few requests as possible. Raises RewardError."""
+        """Score episodes at their newest steps, with as few requests as possible. Raises RewardError."""
         return await self._steps.scores(asked, self._call({}), time.perf_counter())
 
     async def encode(
@@ -232,7 +233,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         return await self._scorer.embeddings(trajectory, self._call({"timeout_s": timeout_s, "request_id": request_id}))
 
     async def probe(self, model: ModelInfo, *, timeout_s: float | None = None) -> None:
-        """Score a blank sample, which the server's metrics leave out. Raises RewardError if that fails."""
+        """Score a blank sample, which the server's metrics ignore. Raises RewardError on failure."""
         await self.progress(blank_trajectory(model.widths), timeout_s=timeout_s, request_id=PROBE_PREFIX)
 
     async def is_ready(self, *, timeout_s: float | None = None) -> bool:
@@ -241,7 +242,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         return await self._servers.is_ready((self.model, frames_name(self.model)), left_s)
 
     async def wait_ready(self, timeout_s: float) -> None:
-        """Return as soon as ``is_ready``. Raises DeadlineExceededError, or ServerUnavailableError for wrong ports."""
+        """Wait until ``is_ready``. Raises DeadlineExceededError, or ServerUnavailableError for wrong ports."""
         deadline = self._deadline(timeout_s)
         await self._servers.check_ports()
         while deadline.ends_within(0) or not await self.is_ready(
@@ -255,7 +256,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
 
     @property
     def model_names(self) -> dict[Part, str]:
-        """Model names for the checkpoint on a server, served or not."""
+        """Model names that belong to the checkpoint, whether served or not."""
         name = self.model
         return {"embeddings": name, "encoder": encoder_name(name), "frames": frames_name(name)}
 
@@ -272,7 +273,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         return await self._scorer.model_info(name, self._deadline(timeout_s), refresh=refresh)
 
     async def model_infos(self, *, timeout_s: float | None = None) -> dict[Part, list[ModelInfo]]:
-        """Describe each served part of the checkpoint, as every reachable server does.
+        """Describe the checkpoint's served parts, as reported by every reachable server.
 
         Raises RewardError if no server answers.
         """
@@ -284,7 +285,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         return told
 
     def stop_retrying(self) -> None:
-        """Make later failures end their calls at once, as ``close`` does first."""
+        """Let later failures end their calls at once. ``close`` does this first."""
         self._servers.stop_retrying()
 
     async def close(self) -> None:
@@ -302,12 +303,12 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         return ""
 
     def _call(self, options: CallOptions) -> Call:
-        """A call that begins now. Raises TypeError for an unknown option."""
+        """Return a call that begins now. Raises TypeError for an unknown option."""
         others: dict[str, Any] = {**options}
         return Call(self._deadline(others.pop("timeout_s", None)), **others)
 
     def _deadline(self, timeout_s: float | None) -> Deadline:
-        """Deadline of a call that begins now; timeout_s: None: the client's."""
+        """Return the deadline for a call that begins now. timeout_s: None: the client's."""
         if self._is_closed:
             raise ClientClosedError("this AsyncRewardClient is closed")
         loop = asyncio.get_running_loop()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""RewardClient: blocking client of served reward models, for any number of threads."""
+"""RewardClient: blocking client for served reward models, usable from any number of threads."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 
 class RewardClient(ClientOptions, Closing, OneProcess):
-    """Blocking, thread-safe client: an AsyncRewardClient whose event loop runs in a thread of its own.
+    """Blocking, thread-safe client: an AsyncRewardClient whose event loop runs in a separate thread.
 
-    ``help(RewardClient.__init__)`` describes the options. Errors are AsyncRewardClient's. It closes as a context
-    manager and at the interpreter's end. It does not survive a fork: make a client in each process.
+    ``help(RewardClient.__init__)`` describes the options. Errors are the same as AsyncRewardClient's. The client closes
+    as a context manager and at interpreter exit. It does not survive a fork: create one client per process.
     """
 
     def __post_init__(self) -> None:
@@ -56,11 +56,11 @@ class RewardClient(ClientOptions, Closing, OneProcess):
     def curve(
         self, trajectory: Trajectory, sampling: Sampling | None = None, **options: Unpack[CallOptions]
     ) -> ProgressResult:
-        """Return the scores of each frame on the frames up to it, as AsyncRewardClient.curve. Raises RewardError."""
+        """Score every frame from the frames up to it, as AsyncRewardClient.curve does. Raises RewardError."""
         return self._loop.wait(self._client.curve(trajectory, sampling, **options))
 
     def similarity(self, reference: Trajectory, other: Trajectory, **options: Unpack[CallOptions]) -> SimilarityResult:
-        """Return the raw similarity score of ``other`` to ``reference``. Raises RewardError."""
+        """Return a raw score for how similar ``other`` is to ``reference``. Raises RewardError."""
         return self._loop.wait(self._client.similarity(reference, other, **options))
 
     @overload
@@ -74,9 +74,9 @@ class RewardClient(ClientOptions, Closing, OneProcess):
     def evaluate(
         self, samples: Iterable[Sample], *, return_errors: bool = False, **options: Unpack[CallOptions]
     ) -> list[Result] | list[Result | RewardError]:
-        """Score any number and mix of samples; return results in order.
+        """Score samples in any number and mix; return results in order.
 
-        return_errors: True: put a RewardError in place of a failed result; False: raise the first error
+        return_errors: True: return a RewardError in place of a failed result; False: raise the first error
         """
         samples = list(samples)  # in this thread: an iterator may be slow, or call this client
         return self._loop.wait(self._client.evaluate(samples, return_errors=return_errors, **options))
@@ -88,7 +88,7 @@ class RewardClient(ClientOptions, Closing, OneProcess):
     @overload
     def submit(self, sample: SimilaritySample, **options: Unpack[CallOptions]) -> Future[SimilarityResult]: ...
     def submit(self, sample: Sample, **options: Unpack[CallOptions]) -> Future[Any]:
-        """Send the sample and return a future of its result, at once.
+        """Send the sample and return a future for the result at once.
 
         The future raises RewardError; cancelling it cancels the request. Arrays are copied, so the caller may change
         them. Beyond ``max_in_flight`` open requests, copies wait in memory.
@@ -98,23 +98,23 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         return future
 
     def episode(self, task: str, *, env: int | None = None, **options: Unpack[StepKeywords]) -> Episode:
-        """Return an episode to score step by step. A step sends only the new frame, if the server keeps features.
+        """Return an episode to score step by step. A step sends only the new frame if the server caches features.
 
-        env: index of the environment, shown in errors as ``envs[3]``; None: the only one
-        options: fields of EpisodeOptions. Raises ValueError for contradictory options
+        env: environment index, shown in errors as ``envs[3]``; None: the only one
+        options: EpisodeOptions fields. Raises ValueError for contradictory options
         """
         return Episode(self._client.episode(task, env=env, **options), self._loop, self)
 
     def episodes(self, num: int, task: str | Sequence[str], **options: Unpack[StepKeywords]) -> Episodes:
-        """Return ``num`` parallel episodes, as in vectorised environments. A step needs as few requests as possible.
+        """Return ``num`` parallel episodes, as in vectorised environments. A step sends as few requests as possible.
 
-        task: a sentence for all episodes, or a sentence for each
+        task: one sentence for all episodes, or one per episode
         options: as in ``episode``
         """
         return Episodes(self._client.episodes(num, task, **options), self._loop, self)
 
     def score_episodes(self, episodes: Sequence[Episode]) -> list[StepScore]:
-        """Score each episode at the newest frame, in as few requests as possible. Raises RewardError.
+        """Score all episodes at their newest frames, with as few requests as possible. Raises RewardError.
 
         Frames come from ``Episode.keep``, and stay in the episodes after a failure.
         """
@@ -140,7 +140,7 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         return self._loop.wait(self._client.is_ready(timeout_s=timeout_s))
 
     def wait_ready(self, timeout_s: float) -> None:
-        """Return as soon as ``is_ready``. Raises DeadlineExceededError, or ServerUnavailableError for wrong ports."""
+        """Wait until ``is_ready``. Raises DeadlineExceededError, or ServerUnavailableError for wrong ports."""
         self._loop.wait(self._client.wait_ready(timeout_s))
 
     def model_info(self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None) -> ModelInfo:
@@ -153,7 +153,7 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         return self._loop.wait(self._client.model_info(frames=frames, refresh=refresh, timeout_s=timeout_s))
 
     def model_infos(self, *, timeout_s: float | None = None) -> dict[Part, list[ModelInfo]]:
-        """Describe each served part of the checkpoint, as every reachable server does.
+        """Describe the checkpoint's served parts, as reported by every reachable server.
 
         Raises RewardError if no server answers.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Parts of ``rfm-client`` commands: options, errors on one line, exit codes, tables. Applications build on it.
+"""Building blocks for ``rfm-client`` commands: options, one-line errors, exit codes, tables. Applications build on it.
 
 Needs ``rfm-client[cli]``.
 """

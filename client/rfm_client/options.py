@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Declare settings of a command or a configuration file, and check values. Applications build on it."""
+"""Declare settings for a command or configuration file, and check values. Applications build on it."""
 
 from rfm_client.contract.checks import checked_count, checked_finite, first_names, git_lfs_pointer, is_blank, require
 from rfm_client.contract.errors import InvalidValueError

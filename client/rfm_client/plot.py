@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Curves of several results in one figure, sized for a paper's column. Needs ``rfm-client[cli]`` (matplotlib)."""
+"""Plot score curves for several results, sized for a paper's column. Needs ``rfm-client[cli]`` (matplotlib)."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ if TYPE_CHECKING:
 __all__ = ["plot_scores", "save"]
 
 MAX_CURVES = 40  # colours times line styles
-STYLE = ("default", "rfm_client.figure")  # figure.mplstyle has colours, fonts and lines of every figure
-COLOURS = {"progress": "C0", "success": "C2", "remaining_s": "C3"}  # of a score where a figure shows one trajectory
+STYLE = ("default", "rfm_client.figure")  # figure.mplstyle sets colours, fonts and lines for every figure
+COLOURS = {"progress": "C0", "success": "C2", "remaining_s": "C3"}  # colour by score, in a figure with one trajectory
 THRESHOLD: dict[str, Any] = {
     "color": "#75808a",
     "linestyle": ":",
     "linewidth": 0.9,
     "zorder": 1,
-}  # the line at which success counts
-FAINT = "#4d5761"  # words of less weight
+}  # the line above which success counts
+FAINT = "#4d5761"  # for less important text
 GRID: dict[str, Any] = {"color": "#dde2e6", "linewidth": 0.5, "zorder": 0}
-BOUNDS = (-0.03, 1.03)  # of an axis from 0 to 1
+BOUNDS = (-0.03, 1.03)  # limits for an axis from 0 to 1
 
-_WIDTH_IN = 3.5  # a column of two
+_WIDTH_IN = 3.5  # one column in a two-column layout
 _HEIGHT_IN = 1.5
 _SUCCESS_IN = 0.7
-_LINE_IN = 0.15  # a line of text
-_LONGEST = 44  # characters of a name that a column has room for
-_SHORT = 20  # characters, so that two names fit side by side
+_LINE_IN = 0.15  # one text line
+_LONGEST = 44  # characters that fit in a one-column legend
+_SHORT = 20  # characters that let two names fit side by side
 _LINES = ("-", "--", "-.", ":")
 
 
@@ -48,17 +48,17 @@ def plot_scores(
     title: str | None = None,
     times_s: Sequence[npt.NDArray[np.float64] | None] | None = None,
 ) -> Figure:
-    """Return a figure with a curve of progress for each result and, below it, of success where it is predicted.
+    """Return a figure with one progress curve per result and, where success is predicted, success curves below.
 
-    Models that predict another score in place of progress, such as remaining seconds, have an axis in its unit.
+    Models that predict another score instead of progress, such as remaining seconds, get an axis in that unit.
 
-    It is light, whatever style is set, and 3.5 inches wide. A dotted line marks a success of 0.5. ``save`` writes it.
-    ``matplotlib.style.use("rfm_client.figure")`` gives other figures the same style.
+    The figure is light whatever style is set, and 3.5 inches wide. A dotted line marks success 0.5. ``save`` writes the
+    figure. ``matplotlib.style.use("rfm_client.figure")`` gives other figures the same style.
 
-    names: of the curves, in the legend; long names lose their middle
-    times_s: for each result float64 [T], the times of its T scored frames; the axis counts frames if one is unknown
+    names: curve names for the legend; long names lose their middle
+    times_s: per result float64 [T], the times of the T scored frames; the axis counts frames if any are unknown
 
-    Raises ValueError for no result, for more than 40, and for another number of names or times; ImportError without
+    Raises ValueError for no results, for more than 40, and if the number of names or times differs; ImportError without
     matplotlib.
     """
     require("results", 0 < len(results) <= MAX_CURVES, f"1 to {MAX_CURVES}", len(results))
@@ -79,7 +79,7 @@ def plot_scores(
     scores = [*dict.fromkeys(result.leading for result in results), *["success"] * has_success]
     heights_in = [_SUCCESS_IN if score == "success" else _HEIGHT_IN for score in scores]
     with matplotlib.style.context([*STYLE]):
-        colours = matplotlib.rcParams["axes.prop_cycle"].by_key()["color"]  # "C0" would be of a later style
+        colours = matplotlib.rcParams["axes.prop_cycle"].by_key()["color"]  # "C0" would follow a style set later
         columns = 2 if max(map(len, names)) <= _SHORT else 1
         lines_in = _LINE_IN * (-(-len(results) // columns) + 3 + (title or "").count("\n"))
         figure = Figure(figsize=(_WIDTH_IN, sum(heights_in) + lines_in), layout="constrained")
@@ -89,10 +89,10 @@ def plot_scores(
                 if score not in ("success", result.leading):
                     continue
                 colour, line = colours[number % len(colours)], _LINES[number // len(colours)]
-                marker = "o" if len(x) == 1 else ""  # a point alone makes no line
+                marker = "o" if len(x) == 1 else ""  # a single point draws no line
                 label = _shortened(names[number]) if score == result.leading else None
                 values = getattr(result, score)
-                known = ~np.isnan(values)  # the line passes over frames without an answer
+                known = ~np.isnan(values)  # the line skips frames without an answer
                 ax.plot(x[known], values[known], color=colour, linestyle=line, marker=marker, label=label)
             about = FRAME_SCORES[score]
             ax.set_ylabel(about.title(score))
@@ -109,11 +109,11 @@ def plot_scores(
 
 
 def save(figure: Figure, file: Path | str) -> None:
-    """Write a figure in the format of the file's suffix, such as .png (200 dots an inch), .pdf or .svg."""
+    """Write a figure in the format given by the file suffix, such as .png (200 dots per inch), .pdf or .svg."""
     import matplotlib.style
 
     with matplotlib.style.context([*STYLE]), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph")  # letters that the font lacks are drawn as boxes
+        warnings.filterwarnings("ignore", message="Glyph")  # letters missing from the font appear as boxes
         figure.savefig(file)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rerun recordings (.rrd) of frames and scores, on one timeline.
+"""Rerun recordings (.rrd) that show frames and scores on one timeline.
 
 Needs ``rfm-client[rerun]``. T frames, H x W pixels.
 """
@@ -20,8 +20,8 @@ from rfm_client.transport.threads import Closing
 
 __all__ = ["Recording"]
 
-TIME = "video_time"  # timeline in seconds of the video
-FRAME = "frame"  # timeline in frames, where seconds are unknown
+TIME = "video_time"  # timeline in video seconds
+FRAME = "frame"  # timeline in frames, when times are unknown
 IMAGE, PROGRESS, SUCCESS = "image", "progress", "success"
 JPEG_QUALITY = 90  # as good as the video, at a tenth of the size
 
@@ -32,12 +32,12 @@ _COLOURS = {PROGRESS: (31, 119, 180), SUCCESS: (44, 160, 44)}  # as in plots
 class Recording(Closing):
     """A recording file to which any thread can add trajectories. The first trajectory creates the file.
 
-    Each trajectory is an entity with ``image``, ``progress`` and ``success``. Scores that the checkpoint does not
+    A trajectory becomes an entity with ``image``, ``progress`` and ``success``. Scores that the checkpoint does not
     predict are left out.
     """
 
     def __init__(self, file: Path) -> None:
-        """Raise ImportError, with the extra to install, if the package is missing."""
+        """Raise ImportError, naming the extra to install, if the package is missing."""
         try:
             import rerun
         except ImportError as error:
@@ -56,14 +56,14 @@ class Recording(Closing):
     ) -> None:
         """Add a trajectory with its scores.
 
-        entity: parts of its name; empty for the only trajectory of a file
-        videos: by camera, T frames, uint8 [H, W, 3]; a single camera's name is empty; empty for embeddings
-        times_s: float64 [T], times of the frames in the video; None: unknown
+        entity: parts of its name; empty for the only trajectory in a file
+        videos: by camera, T frames, uint8 [H, W, 3]; a single camera has an empty name; no entries for embeddings
+        times_s: float64 [T], frame times in the video; None: unknown
         """
         curves = {curve: getattr(scores, curve) for curve in _COLOURS if not np.isnan(getattr(scores, curve)).all()}
         with self._lock:
             self._open()
-            self._stream.reset_time()  # of this thread's trajectory before
+            self._stream.reset_time()  # set by this thread's previous trajectory
             for curve in curves:
                 style = self._rerun.SeriesLines(names=curve, colors=_COLOURS[curve])
                 self._log((*entity, curve), style, static=True)
@@ -75,11 +75,11 @@ class Recording(Closing):
             for position, index in enumerate(scores.scored_frames.tolist()):
                 self._set_time(index, times_s)
                 for curve, values in curves.items():
-                    if not np.isnan(values[position]):  # else the model did not answer about the frame
+                    if not np.isnan(values[position]):  # else the model gave no answer for the frame
                         self._log((*entity, curve), self._rerun.Scalars(float(values[position])))
 
     def close(self) -> None:
-        """Write the rest to the file."""
+        """Flush the recording to the file."""
         if self._stream is not None:
             self._stream.disconnect()
 
@@ -95,4 +95,4 @@ class Recording(Closing):
             self._stream.set_time(TIME, duration=float(times_s[index]))
 
     def _log(self, parts: Sequence[str], what: Any, *, static: bool = False) -> None:
-        self._stream.log(list(parts), what, static=static, strict=True)  # otherwise it only warns of errors
+        self._stream.log(list(parts), what, static=static, strict=True)  # by default it only warns about errors

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Parts of servers in front of a served checkpoint: addresses, logs, credentials, the state of Triton."""
+"""Building blocks for servers in front of Triton: addresses, logs, credentials, Triton's status."""
 
 from rfm_client.contract.addresses import ListenAddress, check_certificate
 from rfm_client.contract.process import begin_request, raise_limit, write_log

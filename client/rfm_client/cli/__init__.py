@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The ``rfm-client`` command: scores, comparisons and a server's state on the command line."""
+"""The ``rfm-client`` command: scores, comparisons and server status on the command line."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Base of all commands: options made of settings, errors on one line, exit codes."""
+"""Base for all commands: options built from settings, one-line errors, exit codes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ S = TypeVar("S", bound=Settings)
 
 
 class Given(dict[str, Any], Generic[S]):
-    """Values of the options on the command line, by the name of their setting in S."""
+    """Option values from the command line, by setting name in S."""
 
 
 class ExitCode(IntEnum):
@@ -54,8 +54,8 @@ _ERROR_CODES: dict[type[BaseException], ExitCode] = {
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command with an option for each setting of its ``Settings`` and ``Given`` parameters."""
-    # not typing.get_type_hints, which in Python 3.10 hides the annotation of a parameter whose default is None
+    """Return the command with one option per setting in its ``Settings`` and ``Given`` parameters."""
+    # not typing.get_type_hints, which in Python 3.10 hides a parameter's annotation if the default is None
     own = inspect.signature(command, eval_str=True).parameters.values()
     chosen = {each.name: kind for each in own if (kind := _settings_class(each.annotation)) is not None}
     options = {name: [each for each in kind.settings().values() if each.has_option] for name, kind in chosen.items()}
@@ -80,9 +80,9 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
             command(**values)
         except ConfigError as error:
             raise _named(error, {each.name: each.option for some in options.values() for each in some}) from None
-        except errors.LocatedError as error:  # of what an option names: a server, a dataset
+        except errors.LocatedError as error:  # about what an option names: a server, a dataset
             typed |= {option.strip("-").replace("-", "_"): option for option in typed.values()}
-            if error.where not in typed or error.where == "frames":  # those of a sample
+            if error.where not in typed or error.where == "frames":  # about a sample
                 raise
             raise error.like(error, where=typed[error.where]) from None
 
@@ -92,14 +92,14 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 class Command(TyperCommand):
-    """A command with a help section for each group of options, and errors on one line, without traceback.
+    """A command with a help section for each option group, and one-line errors without traceback.
 
-    Its ``--json`` may stand without a value.
+    ``--json`` may stand without a value.
     """
 
     program = "rfm-client"
-    has_codes = True  # False: every error ends the command with 1
-    unknown_option = ""  # what the error about an unknown {option} also says
+    has_codes = True  # False: every error exits with 1
+    unknown_option = ""  # added to the error about an unknown {option}
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Give ``--json`` without a value the value ``-``, which the parser cannot do. Raises typer.BadParameter."""
@@ -120,22 +120,22 @@ class Command(TyperCommand):
             raise
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return the words of the usage line: an argument's name, in brackets if it may be left out."""
+        """Return the words in the usage line: argument names, in brackets if optional."""
         arguments = [each for each in self.get_params(ctx) if each.param_type_name == "argument"]
         names = [argument_name(each) if each.required else f"[{argument_name(each)}]" for each in arguments]
         return [*([self.options_metavar] if self.options_metavar else []), *names]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write sections for the arguments, the command's own options, and each group of settings."""
+        """Write sections for the arguments, the command's own options, and each settings group."""
         write_options(self, ctx, formatter)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command, and report an error, each of its lines with the name of the program."""
+        """Run the command, and report errors with the program's name on every line."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
             code, lines = ExitCode.INTERRUPTED, ["interrupted"]
-        except BrokenPipeError:  # the reader of the output has closed the pipe
+        except BrokenPipeError:  # whoever reads the output has closed the pipe
             raise
         except ImportError as error:
             code, lines = ExitCode.FAILED, [missing_package(error)]
@@ -148,10 +148,10 @@ class Command(TyperCommand):
 
 
 class CommandGroup(TyperGroup):
-    """Commands, which stand before the options in the help."""
+    """Lists the commands before the options in the help."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words before the command. An error about an option of a command says where that stands."""
+        """Parse the words before the command. An error about a command's option says where to put the option."""
         try:
             return super().parse_args(ctx, args)
         except UsageError as error:
@@ -170,13 +170,13 @@ class CommandGroup(TyperGroup):
 
 
 class Commands(CommandGroup):
-    """The commands of ``rfm-client``. Names the right program for a command of the other one."""
+    """The ``rfm-client`` commands. Names the right program if a command belongs to the other one."""
 
     other_program = "rfm"
     others: Collection[str] = ("export", "serve", "try", "models")
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command. Raises an error of usage with the right name, or the program that has the command."""
+        """Find the command. Raises a usage error with the right name, or the program that has the command."""
         if args[0] in self.others and self.get_command(ctx, args[0]) is None:
             ctx.fail(f"No such command '{args[0]}': that is `{self.other_program} {args[0]}`")
         return super().resolve_command(ctx, args)
@@ -188,7 +188,7 @@ def exit_code(error: BaseException) -> ExitCode:
 
 
 def exit_code_of(failures: Sequence[Exception], *, some_succeeded: bool) -> ExitCode:
-    """Return the exit code after failures of samples: a special code only if all samples failed for one reason."""
+    """Return the exit code after sample failures: a special code only if all samples failed for one reason."""
     codes = {exit_code(error) for error in failures}
     if not codes:
         return ExitCode.OK
@@ -201,14 +201,14 @@ def report(message: str, program: str = "rfm-client") -> None:
 
 
 def fail(message: str, program: str = "rfm-client") -> NoReturn:
-    """Report the message, and end the command with 1."""
+    """Report the message, and exit with 1."""
     report(message, program)
     raise typer.Exit(ExitCode.FAILED)
 
 
 @contextmanager
 def usage_errors(option: str) -> Iterator[None]:
-    """Turn a ValueError into wrong usage of ``option``."""
+    """Turn a ValueError into a usage error for ``option``."""
     try:
         yield
     except ValueError as error:
@@ -223,7 +223,7 @@ def missing_package(error: ImportError) -> str:
 
 
 def _named(error: ConfigError, options: Mapping[str, str]) -> Exception:
-    """Wrong usage of the options whose settings the error names; the error itself for other settings."""
+    """Return a usage error for the options behind the settings in the error; the error itself for other settings."""
     if not {error.where, error.other or error.where} <= options.keys():
         return error
     named = error.named(options.__getitem__)
@@ -233,13 +233,13 @@ def _named(error: ConfigError, options: Mapping[str, str]) -> Exception:
 
 
 def _settings_class(hint: Any) -> type[Settings] | None:
-    """The class of a parameter that is an object of settings, or the ``Given`` ones; None for another parameter."""
+    """Return the Settings class behind a parameter, plain or as ``Given``; None for any other parameter."""
     (kind,) = get_args(hint) if get_origin(hint) is Given else (hint,)
     return kind if isinstance(kind, type) and issubclass(kind, Settings) else None
 
 
 def _parameter(setting: Setting) -> inspect.Parameter:
-    """A setting's parameter for typer. Its default is None, so that a file or the setting's default can decide."""
+    """Return a setting's typer parameter. The default is None, so that a file or the setting's default can decide."""
     must_be_given = setting.default is MISSING
     described = typer.Option(
         f"{setting.option}/{setting.negation}" if setting.default is True else setting.option,
@@ -247,7 +247,7 @@ def _parameter(setting: Setting) -> inspect.Parameter:
         metavar=setting.placeholder,
         envvar=setting.variable,
         show_default=False,
-        show_envvar=False,  # ``help`` has it
+        show_envvar=False,  # ``help`` shows it
         rich_help_panel=setting.title,
     )
     kind = str if setting.parse else list[str] if setting.kind == Texts else setting.kind
@@ -260,12 +260,12 @@ def _parameter(setting: Setting) -> inspect.Parameter:
 
 
 def _key(setting: Setting) -> str:
-    """The name of the parameter that ``_parameter`` returns, which no command's own parameter has."""
+    """Return the name of the parameter from ``_parameter``, which no command's own parameter has."""
     return f"{setting.prefix}{setting.name}_option".replace("-", "_")
 
 
 def _help(setting: Setting) -> str:
-    """The help text with bounds, default and variable of the option."""
+    """Return the help text with the option's bounds, default and variable."""
     default = setting.option if setting.default is True else _shown(setting.default)
     facts = [
         *([setting.bounds] if setting.bounds else []),
@@ -296,7 +296,7 @@ def _set_placeholder(hint: Any) -> None:
 
 
 def _shown(default: Any) -> str:
-    """A default as one would type it; empty for none."""
+    """Return a default as one would type it; empty for none."""
     if default is None or default is False or default is MISSING:
         return ""
     if isinstance(default, tuple):
@@ -305,7 +305,7 @@ def _shown(default: Any) -> str:
 
 
 def add_missing(app: typer.Typer, name: str, reason: str, package: str, program: str = "rfm-client") -> None:
-    """Add a command that says how to install the application that has it."""
+    """Add a stand-in command that says how to install the application that has it."""
 
     @app.command(
         name,

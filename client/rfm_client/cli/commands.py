@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Commands of ``rfm-client``. Optional libraries are imported when a command runs, so that ``--help`` is quick."""
+"""The ``rfm-client`` commands. Optional libraries are imported when a command runs, so that ``--help`` is quick."""
 
 from __future__ import annotations
 
@@ -60,11 +60,11 @@ app = typer.Typer(
     epilog=f"To export and serve models, use rfm on the server: rfm --help\n\n{EXIT_CODES}",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # Rich's tables cut off option names in a terminal of 80 columns
+    rich_markup_mode=None,  # Rich's tables cut off option names in an 80-column terminal
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": MOST_COLUMNS},
 )
 
-_APPLICATIONS = {"evaluate": "labels", "gateway": "gateway", "label": "labels"}  # the packages of commands
+_APPLICATIONS = {"evaluate": "labels", "gateway": "gateway", "label": "labels"}  # the package for each command
 
 VIDEOS = "Videos, .npy or .npz files, or URLs of videos."
 
@@ -229,7 +229,7 @@ def sample(
     failures = [outcome for outcome in outcomes if isinstance(outcome, RewardError)]
     for index, outcome in enumerate(outcomes):
         if isinstance(outcome, RewardError):
-            report(f"samples[{index}]: {with_remedy(outcome, '')}")  # that of videos is none: --num-frames decides
+            report(f"samples[{index}]: {with_remedy(outcome, '')}")  # not the videos' remedy: --num-frames decides
     rows = [(f"{index}", outcome) for index, outcome in enumerate(outcomes) if not isinstance(outcome, RewardError)]
     if output.prints_tables and rows:
         of = "frames" if are_frames(samples) else "embeddings"
@@ -268,7 +268,7 @@ def _report_subsampled(name: str, num_scored: int, num_frames: int) -> None:
 
 
 def _add_applications() -> None:
-    """Add the commands of installed applications; for the others, commands that say how to install them."""
+    """Add the commands of installed applications; for the others, stand-ins that say how to install them."""
     reasons = {name: f"rfm-{_APPLICATIONS[name]} is not installed" for name in _APPLICATIONS}
     for found in sorted(entry_points(group="rfm_client.commands"), key=lambda each: each.name):
         try:

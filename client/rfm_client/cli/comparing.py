@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """``rfm-client compare``: rank videos by how well they do a task.
 
-A model's preference may depend on the order of the two videos, so it compares each pair in both orders. If the orders
+A model's preference may depend on the order of the two videos, so every pair is compared in both orders. If the orders
 disagree, the pair has no verdict.
 """
 
@@ -30,14 +30,14 @@ LEGEND = (
     "A video has no rank (?) if one of its pairs has no answer."
 )
 
-Order = tuple[int, int]  # numbers of the first and second video of a question
+Order = tuple[int, int]  # indices of the first and second video in a question
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """N sources, their scores, and their preferences by one version of the model.
+    """N sources, their scores, and their preferences from one model version.
 
-    scores: of each source alone, as ``score`` gives them; in a preference they depend on the other source
+    scores: for each source alone, as from ``score``; in a preference they depend on the other source
     results: for both orders of every pair
     """
 
@@ -46,7 +46,7 @@ class Comparison:
     results: Mapping[Order, PreferenceResult]
 
     def pair(self, first: int, second: int) -> PreferenceResult:
-        """Return both orders of two sources as one result."""
+        """Return both orders for two sources as one result."""
         return PreferenceResult.of_both_orders(self.results[first, second], self.results[second, first])
 
     def couples(self) -> Iterator[Order]:
@@ -55,7 +55,7 @@ class Comparison:
 
     @cached_property
     def wins(self) -> list[float]:
-        """Each source's mean probability of winning against the others, over both orders."""
+        """Each source's mean probability of winning, averaged over opponents and orders."""
         return [
             fmean(self.pair(index, other).preference for other in self._numbers if other != index)
             for index in self._numbers
@@ -63,20 +63,20 @@ class Comparison:
 
     @cached_property
     def ranks(self) -> list[int | None]:
-        """Each source's place by ``wins``, from 1; None if one of its pairs has no verdict."""
+        """Each source's rank by ``wins``, from 1; None if a pair with this source has no verdict."""
         best_first = sorted(self._numbers, key=self.wins.__getitem__, reverse=True)
         untold = {index for couple in self.couples() if self.pair(*couple).verdict is None for index in couple}
         return [None if index in untold else best_first.index(index) + 1 for index in self._numbers]
 
     @property
     def ranking(self) -> list[int] | None:
-        """Numbers of the sources, the best first; None if a pair has no verdict."""
+        """Source indices, best first; None if a pair has no verdict."""
         if None in self.ranks:
             return None
         return sorted(self._numbers, key=lambda index: cast(int, self.ranks[index]))
 
     def tables(self) -> list[str]:
-        """Return a table of sources, the best first, a table of pairs, and without a ranking a legend."""
+        """Return a table of sources, best first, a table of pairs, and without a ranking a legend."""
         columns = ("video", "rank", "P(wins)", "final progress", "final success", "frames")
         pairs = ("first", "second", "P(first wins)", "asked second first", "mean", "orders")
         return [
@@ -86,7 +86,7 @@ class Comparison:
         ]
 
     def panels(self) -> list[Panel]:
-        """Return a plot's panel for each source, in the order of the table."""
+        """Return a plot panel for each source, in table order."""
         return [
             self.sources[index].panel(
                 f"{self._rank(index)}. {PurePath(self.sources[index].name).name}: wins with P = {self.wins[index]:.3f}",
@@ -119,12 +119,12 @@ class Comparison:
 
 
 def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> Comparison:
-    """Compare every two sources at the task of the first. Raises RewardError."""
+    """Compare every two sources on the first one's task. Raises RewardError."""
     sources = [Source.read(name, video) for name in names]
     trajectories = [_of_one_task(sources[0], source) for source in sources]
     info = client.model_info(frames=trajectories[0].frames is not None)
     limits = info.max_frames if video.subsample else None, info.frame_size if video.resize else None
-    fits = [fitted(ProgressSample(trajectory), *limits) for trajectory in trajectories]  # once, and not in each pair
+    fits = [fitted(ProgressSample(trajectory), *limits) for trajectory in trajectories]  # once, not for every pair
     sent = [fit.sample.trajectories[0] for fit in fits]
     orders = list(itertools.permutations(range(len(sources)), 2))
     answers = client.evaluate([PreferenceSample(sent[first], sent[second]) for first, second in orders])
@@ -139,7 +139,7 @@ def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> 
 
 
 def _of_one_task(first: Source, other: Source) -> Trajectory:
-    """The other's trajectory with the task of the first, so that both orders have the same task."""
+    """Return the other's trajectory with the first's task, so that both orders share a task."""
     if other is first:
         return first.trajectory
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""JSON documents of the commands. A score that a checkpoint does not predict is null."""
+"""JSON documents that the commands print. A score that a checkpoint does not predict is null."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from rfm_client.contract.results import (
 )
 from rfm_client.transport.status import ServerStatus
 
-SIDES = ("first", "second")  # of a comparison
+SIDES = ("first", "second")  # in a comparison
 
 
 def score_document(
     server: ServerOptions, video: VideoOptions, prefix: PrefixOptions, outcomes: Sequence[Outcome]
 ) -> dict[str, Any]:
-    """Return the document of ``score --json``."""
+    """Return the document for ``score --json``."""
     asked = {"sampling": prefix.sampling, "sampled_frames": prefix.frames}
     return {**server.origin, **_asked(video), **asked, "videos": [_outcome(outcome) for outcome in outcomes]}
 
 
 def comparison_document(server: ServerOptions, video: VideoOptions, comparison: Comparison) -> dict[str, Any]:
-    """Return the document of ``compare --json``. ``preference`` is the probability that an order's first video wins.
+    """Return the document for ``compare --json``. ``preference`` is the probability that an order's first video wins.
 
-    For two videos, the top level also has the ``preference`` in the given order, the verdict of both orders, and scores
-    as ``first`` and ``second``. Scores are those of ``score``. A missing verdict, rank or ranking is null.
+    For two videos, the top level also has the ``preference`` in the given order, the verdict from both orders, and
+    scores as ``first`` and ``second``. Scores are those from ``score``. A missing verdict, rank or ranking is null.
     """
     names = [source.name for source in comparison.sources]
     videos = [
@@ -74,7 +74,7 @@ def comparison_document(server: ServerOptions, video: VideoOptions, comparison: 
 
 
 def samples_document(server: ServerOptions, kind: str, outcomes: Sequence[Result | RewardError]) -> dict[str, Any]:
-    """Return the document of ``sample --json``."""
+    """Return the document for ``sample --json``."""
     samples = [
         _error(outcome, str(outcome)) if isinstance(outcome, RewardError) else result_document(outcome)
         for outcome in outcomes
@@ -83,7 +83,7 @@ def samples_document(server: ServerOptions, kind: str, outcomes: Sequence[Result
 
 
 def result_document(result: Result, times_s: Sequence[Times | None] = (None, None)) -> dict[str, Any]:
-    """Return the document of a result.
+    """Return the document for a result.
 
     times_s: float64 [T] for each trajectory, times of its T scored frames; None: unknown
     """
@@ -95,7 +95,7 @@ def result_document(result: Result, times_s: Sequence[Times | None] = (None, Non
 
 
 def frame_document(scores: FrameScores, times_s: Times | None) -> dict[str, Any]:
-    """Return the scores of each frame; ``frame_indices`` count the frames that were read."""
+    """Return each frame's scores; ``frame_indices`` count the frames that were read."""
     return {
         **{name: _or_null(each) for name, each in scores.arrays.items() if not FRAME_SCORES[name].is_per_bin},
         "frame_indices": scores.scored_frames.tolist(),
@@ -104,7 +104,7 @@ def frame_document(scores: FrameScores, times_s: Times | None) -> dict[str, Any]
 
 
 def status_document(statuses: Sequence[ServerStatus]) -> dict[str, Any]:
-    """Return the document of ``status --json``."""
+    """Return the document for ``status --json``."""
     servers = []
     for status in statuses:
         models = [
@@ -141,7 +141,7 @@ def _error(error: Exception, message: str) -> dict[str, Any]:
 
 
 def _or_null(scores: npt.NDArray[Any]) -> list[Any] | None:
-    """The marks, or the numbers as float64 of the same value; None in place of NaN, or of all if all are NaN."""
+    """Return the marks, or the numbers as float64 with the same values; None for a NaN, or for all if all are NaN."""
     missing = np.isnan(scores)
     if missing.all():
         return None

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Messages in the words of the command line, and the sections of a command's help.
+"""Messages in command-line terms, and the sections in a command's help.
 
-No text of libraries, no arguments of Python functions.
+No library texts, no Python function arguments.
 """
 
 from __future__ import annotations
@@ -13,29 +13,29 @@ import typer
 from rfm_client.contract.errors import LocatedError
 from rfm_client.contract.triton import FEWER_FRAMES
 
-MOST_COLUMNS = 110  # of a help text, in a terminal as wide
+MOST_COLUMNS = 110  # widest help text, if the terminal is that wide
 
-_FIRST, _LAST = ("Arguments", "Options"), ("Server", "Credentials")  # sections of a help text
-UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # click's, or that of typer's own copy of click
+_FIRST, _LAST = ("Arguments", "Options"), ("Server", "Credentials")  # sections in a help text
+UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # from click, or from typer's own copy of click
 _EXPECTED = {"int_parsing": "a whole number", "int_from_float": "a whole number", "float_parsing": "a number"}
 
 
 def told(error: Exception) -> str:
-    """Return the message for a command's user, who knows options and no arguments of Python functions."""
+    """Return the message for a command-line user, who knows options but not Python function arguments."""
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}"
     return str(with_remedy(error, "leave --no-subsample out, or score prefixes (--sampling)"))
 
 
 def with_remedy(error: Exception, remedy: str) -> Exception:
-    """Return an error of too many frames with this remedy, or none if it is empty; return others as they are."""
+    """Return a too-many-frames error with this remedy, or none if empty; return other errors as they are."""
     if isinstance(error, LocatedError) and error.remedy == FEWER_FRAMES:
         return type(error).at(error.where, error.expected, error.got, remedy)
     return error
 
 
 def in_plain_words(error: typer.BadParameter) -> str:
-    """Return the message of an invalid value without the words of pydantic, with which typer validates."""
+    """Return the message for an invalid value, without the words of pydantic, which typer validates with."""
     details: list[Any] = getattr(error.__cause__, "errors", list)()
     expected = _EXPECTED.get(details[0]["type"]) if details else None
     if expected is None:
@@ -44,7 +44,7 @@ def in_plain_words(error: typer.BadParameter) -> str:
 
 
 def write_options(command: Any, ctx: Any, formatter: Any) -> None:
-    """Write a section for each group of parameters; required ones stand first in a section."""
+    """Write a section for each parameter group; required parameters come first in a section."""
     sections: dict[str, list[tuple[str, str]]] = {title: [] for title in _FIRST}
     for parameter in sorted(command.get_params(ctx), key=lambda each: not each.required):
         record = parameter.get_help_record(ctx)
@@ -61,5 +61,5 @@ def write_options(command: Any, ctx: Any, formatter: Any) -> None:
 
 
 def argument_name(parameter: Any) -> str:
-    """Return an argument's name as the usage line and the help write it."""
+    """Return an argument's name as shown in the usage line and the help."""
     return str(parameter.metavar or parameter.name.upper())

@@ -30,14 +30,14 @@ from rfm_client.transport.connection import Credentials
 
 DEFAULT_URL = "grpc://localhost:8001"
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.001, 86_400
-FRAMES = "Frames"  # heading of all options that decide which frames are scored, and on what
+FRAMES = "Frames"  # heading for all options that decide which frames are scored, and from what
 MAX_PICTURED = MAX_CURVES  # videos; a larger picture is unreadable, and soon cannot be drawn
 _PICTURES = (".png", ".pdf", ".svg")
 _ENDINGS = {"json": (".json",), "plot": _PICTURES, "strips": _PICTURES, "rrd": (".rrd",)}
 
 
 def check_folder(name: str, folder: Path) -> None:
-    """Raise ConfigError about the setting ``name`` if no file can be made in the folder."""
+    """Raise ConfigError about the setting ``name`` if no file can be created in the folder."""
     if not folder.is_dir():
         raise ConfigError.at(name, f"a folder at {folder}", f"none: mkdir -p {shlex.quote(str(folder))}")
     if not os.access(folder, os.W_OK):
@@ -81,7 +81,7 @@ class CredentialFiles(Settings):
 
 @dataclass(frozen=True)
 class ServerOptions(CredentialFiles):
-    """Servers, model, timeout and credentials of a command."""
+    """A command's servers, model, timeout and credentials."""
 
     TITLE: ClassVar[str] = "Server"
 
@@ -133,7 +133,7 @@ class ServerOptions(CredentialFiles):
 
 @dataclass(frozen=True)
 class StatusOptions(ServerOptions):
-    """Servers whose state is shown."""
+    """Servers whose status is shown."""
 
     NO_OPTION: ClassVar[Collection[str]] = {"model"}
 
@@ -149,7 +149,7 @@ class WaitOptions(ServerOptions):
 
 @dataclass(frozen=True)
 class VideoFiles(Settings):
-    """Task of the videos, and size, orientation and colours of the frames."""
+    """The videos' task, and frame size, orientation and colours."""
 
     TITLE: ClassVar[str] = "Videos"
 
@@ -161,7 +161,7 @@ class VideoFiles(Settings):
 
 @dataclass(frozen=True)
 class FrameRate(Settings):
-    """Frames to take of a video."""
+    """Which frames to sample from a video."""
 
     TITLE: ClassVar[str] = FRAMES
 
@@ -170,19 +170,19 @@ class FrameRate(Settings):
 
 @dataclass(frozen=True)
 class VideoOptions(FrameRate, VideoFiles):
-    """Task of the videos, and choice and size of the frames to send."""
+    """The videos' task, and which frames to send at what size."""
 
     subsample: bool = setting(True, "Reduce each video to the number of frames of training, evenly spaced.")
 
     @property
     def more(self) -> dict[str, Any]:
-        """The arguments of ``load_trajectory`` that only some models read."""
+        """Arguments for ``load_trajectory`` that only some models read."""
         return {name: getattr(self, name) for name in self.settings() if name not in VideoOptions.settings()}
 
 
 @dataclass(frozen=True)
 class ScoredVideos(VideoOptions):
-    """Videos, and what only some models read besides them. Raises ConfigError."""
+    """Videos, and what only some models read besides. Raises ConfigError."""
 
     TITLE: ClassVar[str] = "Robo-Dopamine"
 
@@ -195,7 +195,7 @@ class ScoredVideos(VideoOptions):
     goal: str | None = setting(None, "Picture of the task done, for Robo-Dopamine.", metavar="IMAGE")
 
     def begin(self, videos: Sequence[str]) -> None:
-        """Raise ConfigError for views of more than one video."""
+        """Raise ConfigError if views come with more than one video."""
         if self.views and len(videos) > 1:
             raise ConfigError.at("views", "a single VIDEO, of which they are views", len(videos))
 
@@ -210,7 +210,7 @@ class ScoredVideos(VideoOptions):
 
 @dataclass(frozen=True)
 class PrefixOptions(Settings):
-    """Rule that samples each frame's prefix; without a rule, one pass scores all frames."""
+    """Rule that samples every frame's prefix; without a rule, one pass scores all frames."""
 
     TITLE: ClassVar[str] = FRAMES
 
@@ -244,7 +244,7 @@ class PrefixOptions(Settings):
 
 @dataclass(frozen=True)
 class JsonOutput(Settings):
-    """A file with the results as JSON. Raises ConfigError, before the first request, for an unusable file."""
+    """A file for the results as JSON. Raises ConfigError, before the first request, for an unusable file."""
 
     TITLE: ClassVar[str] = "Outputs"
 
@@ -265,11 +265,11 @@ class JsonOutput(Settings):
 
     @property
     def _files(self) -> dict[str, str | Path]:
-        """The files to write, by option."""
+        """Return the files to write, by option."""
         return {name: value for name in _ENDINGS if (value := getattr(self, name, None)) is not None}
 
     def check_folders(self) -> None:
-        """Raise ConfigError, before the first request, for a file in a folder that is missing or closed."""
+        """Raise ConfigError, before the first request, for a file in a missing or closed folder."""
         for name, file in self._files.items():
             check_folder(name, Path(file).parent)
 
@@ -286,14 +286,14 @@ class JsonOutput(Settings):
 
 @dataclass(frozen=True)
 class PlotOutput(JsonOutput):
-    """Files with a comparison."""
+    """Files that show a comparison."""
 
     plot: Path | None = setting(
         None, "Draw frames of each video above its scores, the best first: .png, .pdf or .svg.", metavar="FILE"
     )
 
     def begin(self, videos: Sequence[str]) -> None:
-        """Raise ConfigError for a missing folder, and for more videos than the files take."""
+        """Raise ConfigError for a missing folder, and for more videos than the files can show."""
         for name in self._files:
             if _ENDINGS[name] == _PICTURES and len(videos) > MAX_PICTURED:
                 raise ConfigError.at(name, f"at most {MAX_PICTURED} videos", len(videos))
@@ -302,7 +302,7 @@ class PlotOutput(JsonOutput):
 
 @dataclass(frozen=True)
 class OutputOptions(PlotOutput):
-    """Files with the scores of videos."""
+    """Files that show the videos' scores."""
 
     plot: Path | None = setting(
         None, "Draw all curves in one figure, sized for a paper: .png, .pdf or .svg.", metavar="FILE"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pictures: film strips with curves of scores. Needs ``rfm-client[cli]``."""
+"""Pictures: film strips with score curves. Needs ``rfm-client[cli]``."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ALL_FRAMES = 10  # that a strip may show, if they are all frames of the trajectory
-MOST_FRAMES, FEWEST_FRAMES = 8, 5  # of a strip of a longer one
-EVEN_ENOUGH = 1.4  # largest gap between frames of a strip, as a multiple of the smallest
-WIDTH_IN = 7.0  # of a page
-COLUMN_WIDTH_IN = 4.8  # of panels side by side
+ALL_FRAMES = 10  # shown in a strip, if the trajectory has no more
+MOST_FRAMES, FEWEST_FRAMES = 8, 5  # shown in a longer trajectory's strip
+EVEN_ENOUGH = 1.4  # largest gap between strip frames, as a multiple of the smallest
+WIDTH_IN = 7.0  # page width
+COLUMN_WIDTH_IN = 4.8  # width of panels side by side
 
 # inches within a panel
 _LEFT, _RIGHT = 0.5, 0.1
-_SECOND_AXIS = 0.35  # more at the right, for success beside a score in a unit
+_SECOND_AXIS = 0.35  # extra space at the right, for success beside a score with a unit
 _TITLE, _STRIP_GAP, _BELOW = 0.22, 0.06, 0.5
 _CURVES = 1.3
 _HIGHEST_FRAME = 1.2
 _FRAME_GAP = 0.04
-_HEADLINE = 0.17  # a line of the figure's title
+_HEADLINE = 0.17  # a line in the figure's title
 _LETTER = 0.08
 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """The part of a plot for one trajectory: T scored frames, and a strip of S frames of H x W pixels.
+    """One trajectory's part of a plot: T scored frames, and a strip of S frames, H x W pixels.
 
     positions: float64 [T], scored frames on the time axis
-    unit: of the positions, ``s`` or ``frame``
+    unit: ``s`` or ``frame``, for the positions
     strip: uint8 [S, H, W, 3]; None: a trajectory of embeddings
     strip_positions: float64 [S]
     """
@@ -56,7 +56,7 @@ class Panel:
 
     @property
     def has_second_axis(self) -> bool:
-        """True if success has an axis of its own, since the other score has a unit."""
+        """True if success has its own axis, because the other score has a unit."""
         return bool(FRAME_SCORES[self.scores.leading].unit) and not np.isnan(self.scores.success).all()
 
     @classmethod
@@ -67,10 +67,10 @@ class Panel:
         frames: UInt8Array | None = None,
         times_s: npt.NDArray[np.float64] | None = None,
     ) -> Panel:
-        """Return the panel of a trajectory's scores. It keeps copies of only the frames that it shows.
+        """Return the panel for a trajectory's scores. It keeps copies of only the frames that it shows.
 
         frames: uint8 [N, H, W, 3], all N frames that were read; None: embeddings
-        times_s: float64 [N], times of these frames; None: unknown
+        times_s: float64 [N], these frames' times; None: unknown
         """
         scored = scores.scored_frames
         positions = scored.astype(np.float64) if times_s is None else times_s[scored]
@@ -80,7 +80,7 @@ class Panel:
 
 
 def _evenly(positions: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
-    """Return the indices of frames for a strip: as many as lie at even distances, the first and the last included."""
+    """Return frame indices for a strip: as many as lie evenly spaced, including the first and the last."""
     best, least = np.arange(len(positions)), np.inf
     counts = range(MOST_FRAMES, FEWEST_FRAMES - 1, -1)
     for count in (*[len(positions)] * (len(positions) <= ALL_FRAMES), *counts):
@@ -96,7 +96,7 @@ def _evenly(positions: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
 
 
 def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, columns: int = 1) -> None:
-    """Draw a picture, in the format of the file's suffix: for each panel the scores, above them frames at their times.
+    """Draw a picture, in the format given by the file suffix: for each panel the scores, and above them frames in time.
 
     title: the first line is bold
     columns: panels side by side
@@ -127,14 +127,14 @@ def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, colum
 
 
 def _wrapped(title: str, width_in: float) -> list[tuple[str, bool]]:
-    """Return the lines of a title that fit the width, and True for those of its first line."""
+    """Return the title's lines, fitted to the width, and True for those from its first line."""
     most = int(width_in / _LETTER)
     return [(part, not number) for number, line in enumerate(title.splitlines()) for part in textwrap.wrap(line, most)]
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Inches of a panel. limits: of the time axis, so that no frame is cut off"""
+    """Panel dimensions in inches. limits: time axis limits, so that no frame is cut off."""
 
     width_in: float
     strip_in: float
@@ -181,7 +181,7 @@ class _Page:
 
 def _draw(page: _Page, panel: Panel, layout: _Layout, height_in: float) -> None:
     begin, end = layout.limits
-    below_in = height_in - _CURVES - _BELOW  # panels of a row share the height of their curves
+    below_in = height_in - _CURVES - _BELOW  # all panels in a row draw their curves at the same height
     axes = page.axes(0, below_in, layout.width_in, _CURVES)
     axes.set_xlim(layout.limits)
     axes.set_xlabel("time (s)" if panel.unit == "s" else "frame", loc="left")

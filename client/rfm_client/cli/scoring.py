@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm-client score``: read trajectories from files, score them, show the results in the order of the files."""
+"""``rfm-client score``: read trajectories from files, score them, show the results in file order."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WORKERS = 8  # videos in memory at a time
-PROBE_S = 2.0  # timeout of the check for a live server
+PROBE_S = 2.0  # timeout for checking that a server is alive
 NOT_ASKED = "not asked, since no server answers any more"
-COLUMNS = (  # headers of ``Scored.row``, and their widths
+COLUMNS = (  # headers for ``Scored.row``, and their widths
     *(("video", 0), ("final progress", 8), ("final success", 7), ("frames", 13)),
     *(("last at s", 7), ("took s", 6), ("version", 7)),
 )
@@ -52,7 +52,7 @@ Times = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A trajectory with all T frames that were read. times_s: float64 [T]; None: unknown"""
+    """A trajectory with all T frames that were read. times_s: float64 [T]; None: unknown."""
 
     name: str
     trajectory: Trajectory
@@ -81,13 +81,13 @@ class Source:
         return None if self.times_s is None else self.times_s[scores.scored_frames]
 
     def panel(self, title: str, scores: FrameScores) -> Panel:
-        """Return the source's panel of a plot."""
+        """Return the source's panel for a plot."""
         return Panel.of(title, scores, self.trajectory.frames, self.times_s)
 
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A source's scores.
+    """A source's scores, ready to show.
 
     checkpoint: as in ``checkpoint_of``
     num_frames: frames that were read
@@ -114,7 +114,7 @@ class Scored:
 
 @dataclass(frozen=True)
 class Failed:
-    """A source without scores. is_server_gone: True: because no server answers any more"""
+    """A source without scores. is_server_gone: True: because no server answers any more."""
 
     name: str
     error: Exception
@@ -124,14 +124,14 @@ class Failed:
 
 Outcome: TypeAlias = Scored | Failed
 Tell = Callable[[Outcome], None]
-Record = Callable[[int, Source, FrameScores], None]  # any thread calls it
+Record = Callable[[int, Source, FrameScores], None]  # may be called from any thread
 
 
 @dataclass
 class SourceScorer:
     """Scores sources, in several threads, until no server answers any more.
 
-    record: takes each source with its frames, before memory is freed; None: no record
+    record: called with each source and its frames, before memory is freed; None: no record
     """
 
     client: RewardClient
@@ -141,19 +141,19 @@ class SourceScorer:
     _gone: RewardError | None = None
 
     def score_all(self, names: Sequence[str], tell: Tell) -> list[Outcome]:
-        """Return the outcomes of all sources, in order. ``tell`` takes each when all before it have arrived."""
+        """Return the outcomes for all sources, in order. ``tell`` gets an outcome once all before it have arrived."""
         with ThreadPoolExecutor(WORKERS) as pool:
             try:
                 futures = [pool.submit(self.outcome, number, name) for number, name in enumerate(names)]
                 for future in futures:
                     tell(future.result())
-            except BaseException:  # an interrupt, or a full disk: no other source shall begin
+            except BaseException:  # an interrupt, or a full disk: start no other source
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
         return [future.result() for future in futures]
 
     def outcome(self, number: int, name: str) -> Outcome:
-        """Return the scores of a source, or the reason of its failure."""
+        """Return a source's scores, or why it failed."""
         started_s = time.monotonic()
         if self._gone is not None:
             return Failed(name, self._gone, NOT_ASKED, is_server_gone=True)
@@ -166,7 +166,7 @@ class SourceScorer:
         except ImportError as error:
             return Failed(name, error, missing_package(error))
         except (RewardError, OSError) as error:
-            if isinstance(error, InvalidSampleError) and error.source == name:  # which the report names
+            if isinstance(error, InvalidSampleError) and error.source == name:  # the report already names it
                 error.source = ""
             return Failed(name, error, told(error), is_server_gone=self._is_server_gone(error))
         if self.record is not None:
@@ -197,12 +197,12 @@ def exit_code_of_outcomes(outcomes: Sequence[Outcome]) -> ExitCode:
     failures = [outcome for outcome in outcomes if isinstance(outcome, Failed)]
     codes = {exit_code(failure.error) for failure in failures if failure.is_server_gone}
     if codes:
-        return min(codes)  # UNAVAILABLE before DEADLINE, which a server that is gone also causes
+        return min(codes)  # UNAVAILABLE before DEADLINE, which a lost server also causes
     return exit_code_of([failure.error for failure in failures], some_succeeded=len(failures) < len(outcomes))
 
 
 def unique_stems(names: Sequence[str]) -> list[str]:
-    """Return a file name for each source: its own without folder and suffix, numbered if taken."""
+    """Return a file name for each source: the name without folder and suffix, numbered if taken."""
     stems: dict[str, None] = {}
     repeated: Counter[str] = Counter()
     for name in names:
@@ -219,30 +219,30 @@ def _evaluate(
 ) -> ProgressResult:
     info = client.model_info(frames=trajectory.frames is not None)
     options: CallOptions = {"all_scores": True, "resize": video.resize}
-    # Of an episode as a whole, all frames are shown at once.
+    # When an episode is scored as a whole, all frames are shown at once.
     if prefix.sampling is None or (info.needs_whole_episode and prefix.sampling == "all"):
         options["subsample"] = video.subsample and prefix.sampling is None
         return client.progress(trajectory, **options)
     try:
         sampling = Sampling.of(prefix.sampling, prefix.frames, info.max_frames)
-    except InvalidValueError as error:  # the options are valid: the checkpoint lacks the number
+    except InvalidValueError as error:  # the options are valid: the checkpoint lacks the count
         raise InvalidSampleError.like(error, where=f"--{error.where}") from error
     return client.curve(trajectory, sampling, **options)
 
 
 def checkpoint_of(client: RewardClient, trajectory: Trajectory) -> str:
-    """Return the source of the checkpoint that scores the trajectory, else the model's name."""
+    """Return where the checkpoint that scores the trajectory comes from, else the model's name."""
     info = client.model_info(frames=trajectory.frames is not None)
     return info.source or info.name
 
 
 def heading(task: str, checkpoints: Iterable[str]) -> str:
-    """Return the title of a figure: the task, and below it the checkpoints."""
+    """Return a figure title: the task, and below it the checkpoints."""
     return "\n".join([*[f'"{task}"'] * (not is_blank(task)), ", ".join(dict.fromkeys(checkpoints))])
 
 
 def figure(scored: Sequence[Scored], task: str) -> Figure:
-    """Return one figure with the curves of these sources. Raises ImportError without matplotlib."""
+    """Return one figure with these sources' curves. Raises ImportError without matplotlib."""
     files = [PurePath(each.name).name for each in scored]
     is_unique = len(set(files)) == len(files)
     return plot_scores(

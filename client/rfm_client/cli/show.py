@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tables of scores and of a server's state, and what to try next, as commands to copy. Needs ``rfm-client[cli]``."""
+"""Tables for scores and server status, and next steps as commands to copy. Needs ``rfm-client[cli]``."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from rfm_client.transport.status import Device, ServerStatus
 
 FILE_WIDTH = 200
 SHORTEST_NAME = 12
-CUT = "..."  # for the left-out part of a name
+CUT = "..."  # replaces the left-out part in a name
 GAP = "  "  # between columns
 
 _GIB = 2**30
@@ -39,19 +39,19 @@ def number(value: float | None, digits: int = 4) -> str:
 
 
 def at_end(scores: FrameScores) -> str:
-    """Return progress at the last frame as text, or what the model predicts in its place, with the unit."""
+    """Return progress at the last frame as text, or what the model predicts instead, with the unit."""
     last, unit = float(scores.arrays[scores.leading][-1]), FRAME_SCORES[scores.leading].unit
     return f"{number(last, 2)} {unit}" if unit else number(last)
 
 
 def in_place_of_progress(results: Iterable[FrameScores]) -> str:
-    """Return a sentence about numbers that stand in place of progress; empty: none do."""
+    """Return a sentence about numbers that replace progress; empty: none do."""
     instead = [FRAME_SCORES[name] for name in sorted({result.leading for result in results} - {"progress"})]
     return " ".join(f"In {score.unit}, in place of progress: {score.meaning.lower()}." for score in instead)
 
 
 def shortened(name: str, width: int) -> str:
-    """Return the name in at most ``width`` characters, without its middle; a file's own name stays if it fits."""
+    """Cut the middle out of a name longer than ``width`` characters; a file's own name stays if it fits."""
     if len(name) <= width or width <= len(CUT):
         return name[:width]
     kept = width - len(CUT)
@@ -61,12 +61,12 @@ def shortened(name: str, width: int) -> str:
 
 
 class Table:
-    """A plain table. Headers wrap to their columns.
+    """A plain table. Headers wrap to fit their columns.
 
     columns: headers
-    cells: all cells of each column, or as wide ones
-    names: number of first columns with names and paths, which are shortened to fit the terminal; a file or a pipe has
-        FILE_WIDTH
+    cells: all cells in each column, or stand-ins of the same width
+    names: how many leading columns hold names and paths, which are shortened to fit the terminal; FILE_WIDTH applies to
+        a file or a pipe
     """
 
     def __init__(self, columns: Sequence[str], cells: Sequence[Iterable[str]], *, names: int = 1) -> None:
@@ -89,7 +89,7 @@ class Table:
         return [self._line(each) for each in (*lines, ["-" * width for width in self._widths])]
 
     def row(self, cells: Sequence[str]) -> str:
-        """Return a table row of headers or cells."""
+        """Return a table row with headers or cells."""
         names = (shortened(name, width) for name, width in zip(cells, self._widths[: self._names], strict=False))
         return self._line([*names, *cells[self._names :]])
 
@@ -99,7 +99,7 @@ class Table:
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, names: int = 1) -> str:
-    """Return a ``Table`` below a title, unless that is empty. Columns that do not fit follow below, after the names."""
+    """Return a ``Table`` below a title, if given. Columns that do not fit follow below, after the names."""
     lines, begin = [title] * bool(title), names
     while begin < len(columns):
         for end in range(len(columns), begin, -1):
@@ -121,8 +121,8 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
 class StreamedTable:
     """A table on standard output, written row by row.
 
-    columns: headers, and widths of the columns behind the first
-    names: all cells of the first column
+    columns: headers, and column widths after the first
+    names: all cells in the first column
     """
 
     def __init__(self, columns: Sequence[tuple[str, int]], names: Sequence[str]) -> None:
@@ -131,7 +131,7 @@ class StreamedTable:
         self._is_begun = False
 
     def write(self, cells: Sequence[str]) -> None:
-        """Write a row at once; before the first, the headers."""
+        """Write a row at once; before the first row, the headers."""
         for line in (*self._table.head * (not self._is_begun), self._table.row(cells)):
             print(line, flush=True)
         self._is_begun = True
@@ -143,7 +143,7 @@ class StreamedTable:
 
 
 def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> str:
-    """Return a table with a row for each trajectory: its sample's answer, and the scores of its last frame."""
+    """Return a table with a row for each trajectory: its sample's answer, and the last frame's scores."""
     shown = []
     for name, result in rows:
         if isinstance(result, ProgressResult):
@@ -160,7 +160,7 @@ def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> str:
 
 
 def status_tables(status: ServerStatus) -> str:
-    """Return tables of models, of their batches, and of the machine if its metrics describe it."""
+    """Return tables for models, their batches, and the machine if its metrics describe it."""
     version = f" {status.version}" if status.version else ""
     title = f"{status.url}: Triton{version}, {'ready' if status.ready else 'not ready'}"
     requests = ("model", "v", "state", "requests since load", "failed since load", "refused since start", "pending now")
@@ -204,12 +204,12 @@ def command(program: str, *words: object) -> str:
 
 
 def next_steps(*steps: tuple[str, str]) -> str:
-    """Return lines for the user. steps: the purpose of each command, and the command"""
+    """Return lines for the user. steps: pairs of purpose and command."""
     return "\n".join(["Next:", *(f"  # {purpose}\n  {line}" for purpose, line in steps)])
 
 
 def score_step(url: str, models: Sequence[str]) -> tuple[str, str]:
-    """Return how to score something with a running server. models: those that score frames"""
+    """Return how to score something with a running server. models: those that score frames."""
     options = [] if url in DEFAULT_URLS else ["--url", url]
     if not models:
         return "score random embeddings", command("rfm-client", "sample", *options)
@@ -218,7 +218,7 @@ def score_step(url: str, models: Sequence[str]) -> tuple[str, str]:
 
 
 def steps_with_server(url: str, models: Sequence[str]) -> str:
-    """Return what to try with a running server. models: those that score frames"""
+    """Return what to try with a running server. models: those that score frames."""
     steps = [score_step(url, models)]
     if models:
         options = [] if DEFAULT_MODEL in models else ["--model", models[0]]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Synthetic samples, to check that a server answers and how fast; also as input of ``perf_analyzer``.
+"""Synthetic samples, to check that a server answers and how fast; also as input for ``perf_analyzer``.
 
-The file has the format of perf_analyzer's ``--input-data`` (its docs/input_data.md). ``data`` has an entry for each
+The file follows perf_analyzer's ``--input-data`` format (its docs/input_data.md). ``data`` has an entry for each
 request. Each tensor has ``content`` in row-major order, and ``shape`` without the batch axis, which perf_analyzer adds.
 Numbers are base64 of their little-endian bytes.
 """
@@ -52,7 +52,7 @@ def num_samples_setting(default: int) -> Any:
 
 @dataclass(frozen=True)
 class SyntheticSamples(Settings):
-    """Type and number of synthetic samples, and lengths of their trajectories."""
+    """Synthetic samples: type, number, and trajectory lengths."""
 
     TITLE: ClassVar[str] = "Samples"
 
@@ -68,7 +68,7 @@ class SyntheticSamples(Settings):
     seed: int = setting(0, "Seed of the random numbers.", least=0)
 
     def samples(self, client: RewardClient) -> list[Sample]:
-        """Return samples in the widths of the served checkpoint. Raises ModelNotFoundError if no model takes them."""
+        """Return samples with the served checkpoint's widths. Raises ModelNotFoundError if no model takes them."""
         info = None
         if not self.use_frames:
             with suppress(ModelNotFoundError):
@@ -85,7 +85,7 @@ class SyntheticSamples(Settings):
 
 @dataclass(frozen=True)
 class BenchSamples(SyntheticSamples):
-    """Synthetic samples of a benchmark."""
+    """Synthetic samples for a benchmark."""
 
     num_samples: int = num_samples_setting(64)
 

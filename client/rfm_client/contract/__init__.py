@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Samples, results, errors, names and tensors that client and server share."""
+"""Samples, results, errors, names and tensors shared by client and server."""
 
 from rfm_client.contract.description import FrameSize, ModelInfo
 from rfm_client.contract.errors import (

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Addresses of servers: URLs, listen addresses, certificate files (PEM), and proxies that the environment names.
+"""Server addresses: URLs, listen addresses, certificate files (PEM), and proxies set in the environment.
 
-Calls to this machine use no proxy. For other hosts gRPC and urllib decide, each by its own variables. This module
+Calls to this machine use no proxy. For other hosts gRPC and urllib decide, each from its own variables. This module
 repeats their rules for error messages. The client's HTTP transport uses no proxy.
 """
 
@@ -37,7 +37,7 @@ _OPENSSL_REASONS = {
 
 
 def split_url(url: str) -> tuple[str, str]:
-    """Return the scheme (``grpc``, ``http``, ``grpcs`` or ``https``) and ``host:port`` of a URL. Raises ValueError.
+    """Return a URL's scheme (``grpc``, ``http``, ``grpcs`` or ``https``) and ``host:port``. Raises ValueError.
 
     ``dns:///host:port``, gRPC's own form, means ``grpc://host:port``. An IPv6 address needs brackets.
     """
@@ -52,7 +52,7 @@ def split_url(url: str) -> tuple[str, str]:
 
 
 def host_of(address: str) -> str:
-    """Return the host of ``host:port``, an IPv6 address without its brackets."""
+    """Return the host in ``host:port``, with an IPv6 address stripped of brackets."""
     return address.rpartition(":")[0].strip("[]")
 
 
@@ -72,12 +72,12 @@ def _is_ipv6(host: str) -> bool:
 
 
 def check_certificate(certificate: str | Path, key: str | Path, where: str) -> None:
-    """Raise ConfigError of the setting ``where`` unless a server can serve with this certificate and key (PEM)."""
+    """Raise ConfigError for the setting ``where`` unless a server can use this certificate and key (PEM)."""
     load_certificate(ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), certificate, key, where)
 
 
 def check_authorities(file: str | Path, where: str) -> None:
-    """Raise ConfigError of the setting ``where`` unless the file holds certificates of authorities (PEM)."""
+    """Raise ConfigError for the setting ``where`` unless the file holds CA certificates (PEM)."""
     try:
         ssl.create_default_context(cafile=file)
     except OSError as error:
@@ -85,28 +85,28 @@ def check_authorities(file: str | Path, where: str) -> None:
 
 
 def load_certificate(context: ssl.SSLContext, certificate: str | Path, key: str | Path, where: str) -> None:
-    """Load a certificate and its key (PEM) into the context. Raises ConfigError of the setting ``where``."""
+    """Load a certificate and its key (PEM) into the context. Raises ConfigError for the setting ``where``."""
     try:
-        context.load_cert_chain(certificate, key, password="")  # else OpenSSL prompts for a password
+        context.load_cert_chain(certificate, key, password="")  # otherwise OpenSSL prompts for a password
     except OSError as error:
         expected = f"a certificate and its key (PEM, unencrypted) at {certificate} and {key}"
         raise ConfigError.at(where, expected, _reason(error)) from None
 
 
 def _reason(error: OSError) -> str:
-    """What is wrong with a PEM file, in place of OpenSSL's words."""
+    """Say what is wrong with a PEM file, instead of quoting OpenSSL."""
     if not isinstance(error, ssl.SSLError):
         return error.strerror or str(error)
     return _OPENSSL_REASONS.get(error.reason or "", "a file in another format")
 
 
 def in_url(host: str) -> str:
-    """Return the host as a URL writes it: IPv6 in brackets."""
+    """Return the host as written in a URL: IPv6 in brackets."""
     return f"[{host}]" if ":" in host else host
 
 
 def from_here(host: str) -> str:
-    """Return the address by which this machine reaches a server that listens at ``host``."""
+    """Return the address at which this machine reaches a server that listens on ``host``."""
     return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
 
 
@@ -123,7 +123,7 @@ class ListenAddress:
         return is_loopback(self.host)
 
     def url(self, scheme: str) -> str:
-        """Return the URL by which this machine reaches the server."""
+        """Return the URL at which this machine reaches the server."""
         return f"{scheme}://{in_url(from_here(self.host))}:{self.port}"
 
     def check_free(self, where: str, *, port_option: str, host_option: str = "--host") -> None:
@@ -140,13 +140,13 @@ class ListenAddress:
             raise InvalidValueError.at(where, expected, reason, remedy) from None
 
 
-_OF_GRPC = ("grpc_proxy", "https_proxy", "http_proxy")  # the first that is set counts, even if empty
+_OF_GRPC = ("grpc_proxy", "https_proxy", "http_proxy")  # the first one set counts, even if empty
 _NOT_OF_GRPC = ("no_grpc_proxy", "no_proxy")
 _CREDENTIALS = re.compile(r"[^/@]*@")
 
 
 def grpc_proxy(address: str) -> str | None:
-    """Return ``VARIABLE=VALUE`` of the proxy that gRPC uses for ``host:port``, without a password; None: no proxy."""
+    """Return ``VARIABLE=VALUE`` for the proxy that gRPC uses for ``host:port``, without a password; None: no proxy."""
     host = host_of(address)
     name = next((name for name in _OF_GRPC if name in os.environ), None)
     if name is None or not os.environ[name] or is_loopback(host):
@@ -161,7 +161,7 @@ def open_url(url: str, timeout_s: float) -> Any:
     """Open the URL and return the response. Raises OSError or HTTPException."""
     scheme, host = urlsplit(url).scheme, urlsplit(url).hostname or ""
     proxies = urllib.request.ProxyHandler({} if is_loopback(host) else None)
-    try:  # a new opener, since urlopen keeps the proxies of its first call
+    try:  # a new opener, because urlopen keeps the proxies from its first call
         return urllib.request.build_opener(proxies).open(url, timeout=timeout_s)
     except OSError as error:
         proxy = urllib.request.getproxies().get(scheme)
@@ -171,7 +171,7 @@ def open_url(url: str, timeout_s: float) -> Any:
 
 
 def _matches(host: str, entry: str) -> bool:
-    """True if an entry of no_proxy names the host by gRPC's rules: the end of a name, or a network (CIDR)."""
+    """True if a no_proxy entry covers the host by gRPC's rules: a name's ending, or a network (CIDR)."""
     if host.lower().endswith(entry.lower()):
         return True
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Checks of values from callers, of numbers, tasks and files; lists of names for messages."""
+"""Validate callers' values, numbers, tasks and files; shorten name lists for messages."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Any
 
 from rfm_client.contract.errors import InvalidValueError, LocatedError
 
-_PLACEHOLDERS = {"none", "null", "nan", "n/a", "n.a.", "na", "todo", "tbd", "unknown"}  # for a task
-_LFS_POINTER = b"version https://git-lfs"  # how each begins
+_PLACEHOLDERS = {"none", "null", "nan", "n/a", "n.a.", "na", "todo", "tbd", "unknown"}  # stand-ins for a missing task
+_LFS_POINTER = b"version https://git-lfs"  # how a pointer file begins
 
 
 def require(
@@ -24,13 +24,13 @@ def require(
 
 
 def first_names(names: Collection[object], most: int = 5) -> str:
-    """Return the first names, and the number of the others."""
+    """Return the first names and how many more there are."""
     more = len(names) - most
     return ", ".join(map(str, list(names)[:most])) + (f" and {more} more" if more > 0 else "")
 
 
 def git_lfs_pointer(content: Path | bytes) -> str:
-    """Return what to say of a file that git cloned without git-lfs; empty for all others.
+    """Return a message about a file cloned without git-lfs; empty for all other files.
 
     content: the file, or its first bytes
     """
@@ -42,7 +42,7 @@ def git_lfs_pointer(content: Path | bytes) -> str:
 
 
 def is_blank(task: Any) -> bool:
-    """True for a task without a value, letter or digit, and for a placeholder such as ``N/A``."""
+    """True if a task has no value, letter or digit, or is a placeholder such as ``N/A``."""
     if isinstance(task, str):
         text = task.strip().casefold()
         return text in _PLACEHOLDERS or not any(map(str.isalnum, text))
@@ -52,7 +52,7 @@ def is_blank(task: Any) -> bool:
 def checked_count(
     where: str, value: Any, *, least: int | None = 1, error: type[LocatedError] = InvalidValueError
 ) -> int:
-    """Return a whole number of at least ``least``. Raises ``error``."""
+    """Return a whole number, at least ``least``. Raises ``error``."""
     is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
     require(where, is_whole, "a whole number", repr(value), error)
     require(where, least is None or value >= least, f"at least {least}", value, error)
@@ -60,14 +60,14 @@ def checked_count(
 
 
 def checked_finite(where: str, value: Any, expected: str = "a number") -> float:
-    """Return a finite number. Raises InvalidValueError, whose message says ``expected``."""
+    """Return a finite number. Raises InvalidValueError with ``expected`` in the message."""
     is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
     require(where, is_number and math.isfinite(value), expected, value if is_number else repr(value))
     return float(value)
 
 
 def checked_positive(where: str, value: Any, expected: str = "a number above 0", *, most: float = math.inf) -> float:
-    """Return a number above 0 and at most ``most``. Raises InvalidValueError, whose message says ``expected``."""
+    """Return a number above 0 and at most ``most``. Raises InvalidValueError with ``expected`` in the message."""
     number = checked_finite(where, value, expected)
     require(where, 0 < number <= most, expected, value)
     return number

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The description of a served checkpoint. An export stores it as JSON in config.pbtxt; client and server read it."""
+"""The description of a served checkpoint, which the export writes as JSON to config.pbtxt for client and server."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rfm_client.contract import wire
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, InvalidValueError
 
-DESCRIPTION_PARAMETER = "description"  # of config.pbtxt
+DESCRIPTION_PARAMETER = "description"  # parameter in config.pbtxt
 _WHERE = f"parameter {DESCRIPTION_PARAMETER}"
 
 Rule: TypeAlias = Literal["shortest", "exact"]
@@ -28,8 +28,8 @@ _TEXT = re.compile(r"(?:(shortest) ([1-9][0-9]*))|(?:(exact) ([1-9][0-9]*)x([1-9
 class FrameSize:
     """The size to which a served checkpoint resizes every frame.
 
-    rule: ``shortest`` (ReWiND's encoders): the shorter edge becomes px pixels, the other in proportion, rounded down;
-        ``exact``: the frame gets this height and width
+    rule: ``shortest`` (ReWiND's encoders): the shorter edge becomes px pixels, the other follows in proportion, rounded
+        down; ``exact``: the frame gets this height and width
     edges_px: (px,), or (height, width) for ``exact``
     """
 
@@ -38,7 +38,7 @@ class FrameSize:
 
     @classmethod
     def parse(cls, text: str) -> FrameSize:
-        """Parse ``shortest 256`` or ``exact 224x320``, as ``str`` writes them. Raises ValueError."""
+        """Parse ``shortest 256`` or ``exact 224x320``, as written by ``str``. Raises ValueError."""
         match = _TEXT.fullmatch(text)
         if match is None:
             raise InvalidValueError.at("frame_size", _FORMS, repr(text))
@@ -49,28 +49,28 @@ class FrameSize:
         return f"{self.rule} {'x'.join(map(str, self.edges_px))}"
 
     def fitted(self, height: int, width: int) -> tuple[int, int]:
-        """Return (height, width) to shrink frames of this size to; never larger, since the server enlarges frames."""
+        """Return the (height, width) to shrink a frame to; never larger, because the server enlarges frames."""
         if self.rule == "exact":
             return min(height, self.edges_px[0]), min(width, self.edges_px[1])
         (px,) = self.edges_px
         edge = min(height, width)
         if edge <= px:
             return height, width
-        other = int(px * max(height, width) / edge)  # as by the server, which would resize again after other rounding
+        other = int(px * max(height, width) / edge)  # rounds as the server does, which would otherwise resize again
         return (px, other) if height <= width else (other, px)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Origin:
-    """Facts that only the export knows: the exported files do not show them.
+    """Facts known only at export; the exported files do not show them.
 
-    source: Hub id of the exported checkpoint, or the end of its path; None: unknown
-    revision: exported commit of the Hub; None: the checkpoint was a folder
-    license: licence of the weights, by the checkpoint's model card or config.json; None: unknown
-    run_config: config.yaml of the training run, without secrets; empty: the checkpoint has none
-    computation: number type, PyTorch version and attention kernel, as at the export; None: unknown
-    weights_difference: largest difference of the first of ``scores`` from the full checkpoint's, which the export
-        measured on noise when it rounded weights; None: not measured
+    source: the exported checkpoint's Hub id, or the end of its path; None: unknown
+    revision: the Hub commit that was exported; None: the checkpoint was a folder
+    license: the weights' licence, from the checkpoint's model card or config.json; None: unknown
+    run_config: the training run's config.yaml, without secrets; empty: the checkpoint has none
+    computation: number type, PyTorch version and attention kernel at export; None: unknown
+    weights_difference: largest change that rounding the weights makes to the first of ``scores``, measured on noise at
+        export; None: not measured
     """
 
     source: str | None = None
@@ -83,35 +83,34 @@ class Origin:
 
 @dataclass(frozen=True, kw_only=True)
 class Description(Origin):
-    """A checkpoint, or a part of it: inputs, outputs, limits, origin. The family writes it, the export completes it.
+    """A checkpoint or one part: inputs, outputs, limits, origin. The model family writes it, the export completes it.
 
-    A new fact is a field with a default, so that older exports stay readable. Unknown fields in JSON are ignored.
+    New facts are fields with defaults, so older exports stay readable. Unknown JSON fields are ignored.
 
-    kind: name of the reward model, such as TOPReward; None: unknown
-    network: ``class`` and, of an exported checkpoint, ``module`` (of the class), ``config``, and for each part its
-        class (``types``) and number of weights (``parameters``)
-    video_dim, text_dim: widths D and Dt of embeddings that the model reads, or writes as an encoder; None: neither
-    progress_bins: number C of progress bins of a discrete checkpoint; None: continuous
-    trained_frames: most frames of a trajectory in training; None: unknown
+    kind: the reward model's name, such as TOPReward; None: unknown
+    network: ``class`` and, for an exported checkpoint, its ``module``, ``config``, and for every part its class
+        (``types``) and weight count (``parameters``)
+    video_dim, text_dim: embedding widths D and Dt that the model reads, or writes as an encoder; None: neither
+    progress_bins: how many progress bins C a discrete checkpoint has; None: continuous
+    trained_frames: most frames per trajectory in training; None: unknown
     trained_padding: True if training padded shorter trajectories with their last frame, as upstream does, or if unknown
-    network_frames: frames of the longest trajectory that the network can score; None: no limit
+    network_frames: longest trajectory that the network can score, in frames; None: no limit
     frame_size: size to which the checkpoint resizes frames; None: it depends on the frame
     frames_per_value: consecutive frames that share a score; 2 if a vision-language model reads trajectories as videos
     has_progress, has_preference, has_success, has_similarity: True if the checkpoint gives these scores
-    more_scores: names of the scores of frames that it gives beside progress, success and progress bins: fields of
-        ``FrameScores``
-    scores_whole_prefixes: True if the FastAPI evaluation server shows the model all frames of a prefix, else four
-    may_not_answer: True if its answer may hold no score, also on blank frames. It then gets no warm-up, because Triton
-        does not load a model whose warm-up fails
-    needs_whole_episode: True if its scores are relative to the whole episode, so it cannot score while one runs
-    asks_in_words: True for an ordinary language model, or one with heads of its own, so that no reward head is missing
-    reads_views: True if it reads views of further cameras and a goal; all others refuse samples with them
-    keeps_features: True if it can cache features of frames; it then takes samples with frame references
-    uses_graphs: True if its predictor can score small batches with CUDA graphs
-    is_large: True if float32 on the CPU is slow; exports are verified in the dtype that serves, on a GPU with room
+    more_scores: frame scores beyond progress, success and progress bins: names of ``FrameScores`` fields
+    scores_whole_prefixes: True if the FastAPI evaluation server shows the model all frames in a prefix, else four
+    may_not_answer: True if an answer may hold no score, also for blank frames. The model then gets no warm-up, because
+        Triton does not load a model whose warm-up fails
+    needs_whole_episode: True if scores are relative to the whole episode, so the model cannot score a running episode
+    asks_in_words: True for an ordinary language model, or one with its own heads, where no reward head is missing
+    reads_views: True if the model reads further camera views and a goal; all others refuse samples with them
+    keeps_features: True if the model can cache frame features; it then accepts samples with frame references
+    uses_graphs: True if the predictor can score small batches with CUDA graphs
+    is_large: True if float32 on the CPU is slow; exports are verified in the serving dtype, on a GPU with enough memory
     weights_digest: 16 hex digits, digest of the exported weights; None: not exported
-    settings_digest: 16 hex digits, digest of all else that decides scores: files beside the weights (configuration,
-        tokenizer, image processor), dtype, kind of device; None: not exported
+    settings_digest: 16 hex digits, digest of everything else that decides scores: files beside the weights
+        (configuration, tokenizer, image processor), dtype, device kind; None: not exported
     """
 
     kind: str | None = None
@@ -147,33 +146,33 @@ class Description(Origin):
 
     @property
     def max_frames(self) -> int | None:
-        """Most frames of a trajectory: the smaller limit of training and network; None: both unknown."""
+        """Most frames per trajectory: the smaller limit from training and network; None: both unknown."""
         return min((each for each in (self.trained_frames, self.network_frames) if each is not None), default=None)
 
     @property
     def scores(self) -> tuple[str, ...]:
-        """Names of the scores of frames that the model gives: fields of ``FrameScores``."""
+        """Frame scores that the model gives: names of ``FrameScores`` fields."""
         bins = () if self.progress_bins is None else ("progress_logits",)
         return (*["progress"] * self.has_progress, *["success"] * self.has_success, *bins, *self.more_scores)
 
     @property
     def lacks(self) -> tuple[str, ...]:
-        """Names of the scores among preference, similarity and success that the checkpoint does not give."""
+        """Scores that the checkpoint does not give, among preference, similarity and success."""
         return tuple(name for name in ("preference", "similarity", "success") if not getattr(self, f"has_{name}"))
 
     @property
     def weights(self) -> str | None:
-        """Form of rounded weights (int8, nf4), whose scores are not the full checkpoint's; None: not rounded."""
+        """How weights are rounded (int8, nf4), so that scores differ from the full checkpoint's; None: not rounded."""
         found = self.network.get("config", {}).get("weights")
         return found if isinstance(found, str) else None
 
     def to_json(self) -> str:
         """Return the description as the JSON that ``parse`` reads."""
-        return json.dumps(vars(self), default=str)  # str: of a FrameSize
+        return json.dumps(vars(self), default=str)  # str: for a FrameSize
 
     @classmethod
     def parse(cls, text: str) -> Description:
-        """Return the description of the parameter DESCRIPTION_PARAMETER. Raises InvalidValueError."""
+        """Return the description in parameter DESCRIPTION_PARAMETER. Raises InvalidValueError."""
         expected = "the JSON object of an export"
         try:
             told = json.loads(text)
@@ -185,7 +184,7 @@ class Description(Origin):
 
 
 def _read(name: str, value: Any, kind: Any) -> Any:
-    """Return the field ``name`` of type ``kind``. Raises InvalidValueError for a value of another type."""
+    """Return the field ``name`` as type ``kind``. Raises InvalidValueError for another type."""
     is_union = typing.get_origin(kind) in (types.UnionType, typing.Union)
     parts = tuple(typing.get_origin(part) or part for part in (typing.get_args(kind) if is_union else (kind,)))
     try:
@@ -201,12 +200,12 @@ def _read(name: str, value: Any, kind: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelInfo(Description):
-    """A served model. Facts of its checkpoint: as in ``Description`` and ``Origin``.
+    """A served model. Facts about its checkpoint: as in ``Description`` and ``Origin``.
 
-    versions: versions that its configuration demands; empty: the latest
+    versions: versions that its configuration requests; empty: the latest
     max_batch_size: most samples in a request
     by_digest: True if the model accepts frame references
-    instances: number on a server; 0: an ensemble, whose parts have instances
+    instances: how many a server runs; 0: an ensemble, whose parts have instances
     """
 
     name: str
@@ -216,7 +215,7 @@ class ModelInfo(Description):
     instances: int = 1
 
     def check_scores_prefixes(self) -> None:
-        """Raise InvalidSampleError for a model that cannot score while an episode runs."""
+        """Raise InvalidSampleError if the model cannot score a running episode."""
         if self.needs_whole_episode:
             expected = "a model that scores an episode while it runs"
             got = f"{self.kind}, whose progress is relative to the whole episode: score it at its end"
@@ -224,10 +223,10 @@ class ModelInfo(Description):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> ModelInfo:
-        """Read Triton's model configuration, in the form of its HTTP API.
+        """Read Triton's model configuration, in the HTTP API's form.
 
-        Raises InferenceFailedError for a model without the description of an export, ValueError, LookupError or
-        TypeError for an answer that is no configuration.
+        Raises InferenceFailedError for a model without an export's description; ValueError, LookupError or TypeError
+        for an answer that is not a configuration.
         """
         stored = config.get("parameters", {}).get(DESCRIPTION_PARAMETER, {})
         try:
@@ -247,6 +246,6 @@ class ModelInfo(Description):
 
 
 def num_instances(config: Mapping[str, Any]) -> int:
-    """Return the number of a model's instances: a group has ``count`` on each of its GPUs, or on the CPU."""
+    """Return how many instances a model has: a group has ``count`` on each of its GPUs, or on the CPU."""
     groups = config.get("instance_group", [])
     return sum(int(group.get("count", 1)) * max(len(group.get("gpus", [])), 1) for group in groups)

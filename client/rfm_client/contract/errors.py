@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Errors of invalid values, which carry fields, and errors of a call to the server.
+"""Errors for invalid values, which carry fields, and errors from a call to the server.
 
     RewardError
     +-- InvalidSampleError        the sample is at fault; a retry gives the same answer
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class LocatedError(Exception):
-    """An invalid value at a place, reported as ``where: expected X, got Y; remedy``.
+    """An invalid value and where it is, reported as ``where: expected X, got Y; remedy``.
 
     where: the field, setting or file; empty: unknown
     expected, got, remedy: parts of ``problem``; empty if its text comes from elsewhere
@@ -39,7 +39,7 @@ class LocatedError(Exception):
 
     @classmethod
     def at(cls, where: object, expected: str, got: object, remedy: str = "") -> Self:
-        """Return the error of a value that is not as expected."""
+        """Return the error for a value that is not as expected."""
         if isinstance(got, OSError) and got.strerror:
             got = f"{got.filename}: {got.strerror}" if got.filename else got.strerror
         error = cls(f"expected {expected}, got {got}{'; ' if remedy else ''}{remedy}", where)
@@ -48,7 +48,7 @@ class LocatedError(Exception):
 
     @classmethod
     def like(cls, error: LocatedError, **changed: Any) -> Self:
-        """Return an error of this class with the fields of another, some of them changed."""
+        """Return an error of this class with another error's fields, some of them changed."""
         made = cls(*error.args)
         vars(made).update({**vars(error), **changed})
         return made
@@ -62,15 +62,15 @@ class LocatedError(Exception):
         return f"{self.where}: {self.problem}" if self.where else self.problem
 
     def inside(self, where: object) -> Self:
-        """Return the error with the name of the object around its field: ``where.field: ...``."""
+        """Return the error with the enclosing object's name before its field: ``where.field: ...``."""
         return type(self).like(self, where=f"{where}.{self.where}" if self.where else str(where))
 
 
 def clear_variables(error: BaseException | None) -> None:
-    """Clear the variables of the functions that an error and its causes have left.
+    """Clear the local variables of functions that an error and its causes have left.
 
-    A variable that holds an error from the same function forms a cycle with the error. The arrays of the request would
-    stay in memory until Python's collector of cycles runs.
+    A variable that holds an error from the same function forms a reference cycle. The request's arrays would stay in
+    memory until Python's cycle collector runs.
     """
     while error is not None:
         clear_frames(error.__traceback__)
@@ -82,9 +82,9 @@ class InvalidValueError(LocatedError, ValueError):
 
 
 class RewardError(Exception):
-    """Base of this library's own errors.
+    """Base class for this library's errors.
 
-    request_id: id of the failed request in the server's log, appended to the message; None: no request was sent
+    request_id: the failed request's id in the server's log, appended to the message; None: no request was sent
     may_have_ended_server: True if a model process or the connection ended, perhaps because of the request
     """
 
@@ -93,7 +93,7 @@ class RewardError(Exception):
 
     @property
     def message(self) -> str:
-        """Description of the error, without the request's id."""
+        """The error's description, without the request id."""
         return super().__str__()
 
     def __str__(self) -> str:
@@ -101,7 +101,7 @@ class RewardError(Exception):
 
 
 class InvalidSampleError(RewardError, InvalidValueError):
-    """An invalid sample. source: its video or picture, named at the end of the message; empty: none"""
+    """An invalid sample. source: its video or picture, named at the end of the message; empty: none."""
 
     source = ""
 
@@ -112,20 +112,20 @@ class InvalidSampleError(RewardError, InvalidValueError):
 
 
 class ClientClosedError(RewardError, RuntimeError):
-    """A call of a client that was closed before it, or during it."""
+    """The client was closed before or during the call."""
 
 
 class ServerError(RewardError):
-    """A failure of the server or of the connection to it; the sample may be valid.
+    """The server or the connection to it failed; the sample may be valid.
 
-    fault, remedy: parts of a message with a remedy for users of this library; empty: there is none
+    fault, remedy: parts of the message, if it has a remedy for library users; otherwise empty
     """
 
     fault = remedy = ""
 
 
 class ServerUnavailableError(ServerError):
-    """A server that is unreachable, is not ready, or refuses more requests for now."""
+    """The server is unreachable, not ready, or refuses more requests for now."""
 
 
 class ProcessEndedError(ServerUnavailableError):
@@ -135,13 +135,13 @@ class ProcessEndedError(ServerUnavailableError):
 
 
 class DeadlineExceededError(ServerError, TimeoutError):
-    """No answer came within the caller's time limit. server: the URL, and its proxy; empty: unknown"""
+    """No answer came within the caller's time limit. server: the URL, and its proxy; empty: unknown."""
 
     server = ""
 
 
 class ModelNotFoundError(ServerError):
-    """A model that the server does not serve."""
+    """The server does not serve this model."""
 
 
 class AccessDeniedError(ServerError):
@@ -149,4 +149,4 @@ class AccessDeniedError(ServerError):
 
 
 class InferenceFailedError(ServerError):
-    """A failure of the server at a request (its log has the reason), or an invalid answer."""
+    """The server failed on a request (its log has the reason), or its answer is invalid."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Fetch from the Hugging Face Hub or its cache, with errors in words. Needs ``huggingface_hub``.
+"""Fetch from the Hugging Face Hub or its cache, with readable errors. Needs ``huggingface_hub``.
 
-The library's HTTP exceptions come from httpx since version 1, and most wrap other exceptions.
+Since version 1 the library's HTTP exceptions come from httpx, and most wrap other exceptions.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ _MISSING = (HTTPStatus.UNAUTHORIZED, HTTPStatus.NOT_FOUND)  # the Hub hides priv
 
 
 class HubError(OSError):
-    """The Hub and its cache gave nothing; the message says why."""
+    """Fetching from the Hub and its cache failed; the message says why."""
 
 
 @contextmanager
 def hub_errors() -> Iterator[None]:
-    """Turn exceptions of ``huggingface_hub`` into HubError."""
+    """Turn ``huggingface_hub`` exceptions into HubError."""
     from huggingface_hub.errors import HfHubHTTPError
 
     transport: Any = next(base for base in HfHubHTTPError.__mro__ if base.__name__ == "HTTPError")
@@ -40,7 +40,7 @@ def cached_snapshot(
     """Return the folder of a revision in the Hub's cache, fetched if the Hub answers.
 
     kind: ``model`` or ``dataset``
-    patterns: names of the files to fetch; None: all files
+    patterns: file names to fetch; None: all files
 
     Raises HubError.
     """
@@ -63,10 +63,10 @@ def cached_snapshot(
 def unreachable(repo_id: str, kind: str = "model", revision: str | None = None) -> str | None:
     """Return why the Hub does not answer; None if it has the repository and revision.
 
-    Without this check, the library waits forever for a server that does not answer a request for the list of files.
+    Without this check, the library waits forever when a server does not answer the file list request.
 
     kind: ``model`` or ``dataset``
-    Raises HubError for a repository or revision that the Hub refuses.
+    Raises HubError if the Hub refuses the repository or revision.
     """
     from huggingface_hub import HfApi
     from huggingface_hub.constants import HF_HUB_ETAG_TIMEOUT
@@ -83,7 +83,7 @@ def unreachable(repo_id: str, kind: str = "model", revision: str | None = None) 
 
 
 def _status(error: BaseException | None) -> int | None:
-    """Return the HTTP status of the Hub's answer; None without an answer."""
+    """Return the HTTP status that the Hub answered with; None without an answer."""
     return getattr(getattr(error, "response", None), "status_code", None)
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A server's process: its log, on standard error, and the number of files that it may have open.
+"""A server process: its log on standard error, and how many files it may open.
 
-`rfm serve`, the gateway and the model processes write one format:
+`rfm serve`, the gateway and the model processes write the same format:
 
 2026-11-27T09:30:00.123Z ERROR rfm-gateway[57] request=7f62c7f345dedac0-1: the message
 """
@@ -25,19 +25,19 @@ from rfm_client.contract.wire import PROBE_PREFIX, REQUEST_ID
 LEVEL_VARIABLE = "RFM_LOG_LEVEL"
 
 _LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
-_OURS = ("rfm", "rfm_client", "rfm_gateway")  # loggers that the level is for: at DEBUG, libraries would log too much
-_IN_IDS = "._:/+=@-"  # besides letters and digits
-_MOST_IDS, _MOST_LETTERS = 64, 64  # in a line
-_ID_BYTES = 8  # random, for a request without an id
+_OURS = ("rfm", "rfm_client", "rfm_gateway")  # loggers that the level applies to: at DEBUG, libraries log too much
+_IN_IDS = "._:/+=@-"  # allowed besides letters and digits
+_MOST_IDS, _MOST_LETTERS = 64, 64  # per line, per id
+_ID_BYTES = 8  # random bytes for a request without an id
 
 _requests: ContextVar[str] = ContextVar("requests", default="")
 
 
 def write_log(process: str, environment: Mapping[str, str]) -> None:
-    """Write this process's log to standard error. A line that cannot be written is dropped.
+    """Write this process's log to standard error. Lines that cannot be written are dropped.
 
-    process: name of the process in each line
-    environment: its LEVEL_VARIABLE is the lowest level of the project's own lines; default: INFO
+    process: process name in every line
+    environment: LEVEL_VARIABLE sets the lowest level for the project's own lines; default: INFO
 
     Raises ConfigError for an unknown level.
     """
@@ -46,7 +46,7 @@ def write_log(process: str, environment: Mapping[str, str]) -> None:
         raise ConfigError.at(LEVEL_VARIABLE, f"one of {', '.join(_LEVELS)}", f"{level!r:.100}")
     root = logging.getLogger()
     for each in [each for each in root.handlers if type(each) is logging.StreamHandler]:
-        root.removeHandler(each)  # for the short lines of a command, which becomes a server here
+        root.removeHandler(each)  # it writes a command's short lines, but the command becomes a server here
     handler = _StandardError()
     handler.setFormatter(LogLines(process))
     logging.basicConfig(handlers=[handler], level=logging.INFO)
@@ -55,9 +55,9 @@ def write_log(process: str, environment: Mapping[str, str]) -> None:
 
 
 def begin_request(given: str = "") -> str:
-    """Return the id of a request, and name it in every line that is logged in this context from now on.
+    """Return a request id, and add it to every line logged in this context from now on.
 
-    given: the caller's id. A random id replaces an id that breaks log lines, or by which metrics would count a probe
+    given: the caller's id. A random id replaces one that breaks log lines or that metrics would count as a probe
     """
     is_usable = REQUEST_ID.fullmatch(given) and not given.startswith(PROBE_PREFIX)
     request_id = given if is_usable else secrets.token_hex(_ID_BYTES)
@@ -67,7 +67,7 @@ def begin_request(given: str = "") -> str:
 
 @contextmanager
 def about(ids: Iterable[str]) -> Iterator[None]:
-    """Context manager in which every logged line names these requests."""
+    """Context manager that adds these request ids to every logged line."""
     token = _requests.set(_in_log(ids))
     try:
         yield
@@ -76,23 +76,23 @@ def about(ids: Iterable[str]) -> Iterator[None]:
 
 
 def _in_log(ids: Iterable[str]) -> str:
-    """Return ids without spaces, separated by commas: the beginnings of the first ones."""
+    """Return the first ids, truncated, without spaces, separated by commas."""
     return ",".join(quote(each[:_MOST_LETTERS], safe=_IN_IDS) for each in islice(ids, _MOST_IDS))
 
 
 class _StandardError(logging.Handler):
-    """Unbuffered, so that a line that could not be written leaves nothing behind that fails at exit."""
+    """Unbuffered handler, so that an unwritable line leaves nothing behind that fails at exit."""
 
     def emit(self, record: logging.LogRecord) -> None:
         with suppress(Exception):  # a full disk, a closed pipe, arguments that do not fit the message
-            if sys.stderr is not None:  # None: closed, and another file may have its number
+            if sys.stderr is not None:  # None: closed, and another file may now use the number
                 os.write(2, self.format(record).encode(errors="backslashreplace"))
 
 
 class LogLines(logging.Formatter):
-    """Formatter that puts a head before each line of a record, so that neither tracebacks nor callers can forge lines.
+    """Formatter that puts a head before every line in a record, so that neither tracebacks nor callers can forge lines.
 
-    process: name of the process in each line
+    process: process name in every line
     """
 
     def __init__(self, process: str) -> None:
@@ -100,7 +100,7 @@ class LogLines(logging.Formatter):
         self._process = process
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the lines of a record, each with a newline."""
+        """Return the record's lines, each ending in a newline."""
         text = record.getMessage()
         if record.exc_info:
             text += f"\n{self.formatException(record.exc_info)}"
@@ -114,11 +114,11 @@ def _printable(line: str) -> str:
     return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in line)
 
 
-MOST = 2**16  # some container runtimes allow 2**30, and programs that walk through all descriptors then stand still
+MOST = 2**16  # some container runtimes allow 2**30, and programs that loop over all descriptors then hang
 
 
 def raise_limit() -> int:
-    """Raise this process's limit to what its user may have, at most MOST; return the limit. Children inherit it."""
+    """Raise this process's limit to the user's maximum, at most MOST, and return it. Children inherit the limit."""
     if sys.platform == "win32":
         return MOST
     import resource
@@ -126,7 +126,7 @@ def raise_limit() -> int:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed = MOST if hard == resource.RLIM_INFINITY else min(hard, MOST)
     if soft != resource.RLIM_INFINITY and soft < allowed:
-        with suppress(OSError, ValueError):  # macOS allows less than it says
+        with suppress(OSError, ValueError):  # macOS allows less than it reports
             resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return MOST if soft == resource.RLIM_INFINITY else soft

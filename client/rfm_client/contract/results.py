@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Results of a reward model. T frames, K progress bins."""
+"""Results from a reward model. T frames, K progress bins."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 SUCCESS_THRESHOLD = 0.5
-PAIR_SCORES = ("preference", "similarity")  # of two trajectories
-EVEN = 0.5  # preference for neither trajectory
+PAIR_SCORES = ("preference", "similarity")  # for two trajectories
+EVEN = 0.5  # prefers neither trajectory
 ProgressRule: TypeAlias = Literal["remaining_over_first"]
 
 
 @dataclass(frozen=True)
 class BatchTiming:
-    """Milliseconds that the server spent on the batch of a sample."""
+    """Milliseconds that the server spent on the sample's batch."""
 
     collate_ms: float
     forward_ms: float
@@ -33,22 +33,22 @@ class BatchTiming:
 
 @dataclass(frozen=True)
 class Score:
-    """One array of ``FrameScores``: how it travels, and how files and labels show it.
+    """One ``FrameScores`` array: how it travels, and how files and labels show it.
 
-    Its output tensor, JSON key and column of labels have the field's name. The tensor is FP32.
+    Output tensor, JSON key and label column share the field's name. The tensor is FP32.
 
     meaning: a phrase for label files
-    asked: when a client asks for it: always; of each model for raw frames that gives it (for embeddings: with
-        ``all_scores``); or with an option of a call
+    asked: when a client requests it: always; whenever a model for raw frames gives it (for embeddings: with
+        ``all_scores``); or with a call option
     may_be_unknown: NaN at all frames if the checkpoint does not predict it
-    replaced_by: a score whose models predict it in place of this one, which is NaN at all frames then; empty: none
+    replaced_by: score that some models predict instead; this one is then NaN at all frames; empty: none
     is_per_bin: [T, K], and neither in JSON nor in labels; else [T]
     mark: what True says about a frame, as a clause; empty: numbers, not marks
     bounds: smallest and largest value; None: no bound
     unit: of the values, such as ``s``; empty: none
     higher_is_better: False: lower values are better
     skips_frames: its models answer about some frames only: this score and progress are NaN at the others
-    is_newer: exports of its family exist that lack it, so a served model may gain it
+    is_newer: exports without it exist in the same family, so a served model may gain it
     """
 
     meaning: str
@@ -79,22 +79,22 @@ class Score:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrameScores:
-    """Scores of each frame of one trajectory. Everything else that knows a score derives it from its ``Score``.
+    """Scores for every frame in one trajectory. All other code that knows a score derives it from its ``Score``.
 
     progress: float32 [T], share of the task done, 0..1; NaN throughout: the checkpoint does not predict it; NaN where
         ``is_answered`` is False. Robo-Dopamine's is not clipped and may leave 0..1
     success: float32 [T], probability that the task is done; NaN throughout: the checkpoint does not predict it
-    progress_logits: float32 [T, K], raw scores of the progress bins, on request, from discrete checkpoints only
-    log_prob: float32 [T], logarithm of TOPReward's probability that the frames so far complete the task, on request
-    unclear: bool [T], True where RoboReward's written answer states no single whole score, so that progress may be
-        misread; None: the model writes no answers
+    progress_logits: float32 [T, K], raw scores for the progress bins, on request, from discrete checkpoints only
+    log_prob: float32 [T], TOPReward's log-probability that the frames so far complete the task, on request
+    unclear: bool [T], True where RoboReward's written answer states no single whole score, so progress may be misread;
+        None: the model writes no answers
     remaining_s: float32 [T], RynnValue's seconds from each frame until the task is done
-    relative_s: float32 [T], RynnValue's seconds from the frame before to each frame, negative where the task went
-        backwards; 0 at the first frame
+    relative_s: float32 [T], RynnValue's seconds from the previous frame, negative where the task went backwards; 0 at
+        the first frame
     entropy: float32 [T], entropy in nats of the probabilities behind ``remaining_s``; larger: less sure
-    hop: float32 [T], the change at each frame that Robo-Dopamine compared: in the modes incremental and benchmark the
-        share of what remained that it closed, or, negative, of what was reached that it lost; in the others the
-        difference of progress; NaN: not compared
+    hop: float32 [T], Robo-Dopamine's change at each compared frame; NaN: not compared. Modes incremental and benchmark:
+        the closed share of what remained or, negative, the lost share of what was reached. Other modes: the difference
+        in progress
     frame_indices: int64 [T], indices of the scored frames in the trajectory; None: all frames
     """
 
@@ -157,7 +157,7 @@ class FrameScores:
 
     @property
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """The scores that are there, by name."""
+        """The scores that exist, by name."""
         return {name: scores for name in FRAME_SCORES if (scores := getattr(self, name)) is not None}
 
     @property
@@ -168,23 +168,23 @@ class FrameScores:
 
     @property
     def leading(self) -> str:
-        """The name of the score that tells how far the task is: ``progress``, or what replaces it."""
+        """The score that tells how far the task is: ``progress``, or what replaces it."""
         instead = FRAME_SCORES["progress"].replaced_by
         return instead if instead in self.arrays and np.isnan(self.progress).all() else "progress"
 
     @property
     def scored_frames(self) -> npt.NDArray[np.int64]:
-        """int64 [T], indices of the scored frames in the trajectory, also if all are scored."""
+        """int64 [T], indices of the scored frames in the trajectory, even if all are scored."""
         return np.arange(len(self.progress)) if self.frame_indices is None else self.frame_indices
 
     def at(self, index: slice | npt.NDArray[np.integer[Any]]) -> Self:
-        """Return the scores of the frames at ``index``."""
+        """Return the scores at the frames in ``index``."""
         kept = {} if self.frame_indices is None else {"frame_indices": self.frame_indices}
         return replace(self, **{name: each[index] for name, each in {**self.arrays, **kept}.items()})
 
     @staticmethod
     def joined(parts: Sequence[FrameScores]) -> FrameScores:
-        """Return the scores of the frames of all parts, in order.
+        """Return the scores for all parts' frames, in order.
 
         Raises InferenceFailedError if some parts have a score that others lack.
         """
@@ -203,7 +203,7 @@ class FrameScores:
 
     @property
     def progress_deltas(self) -> Float32Array:
-        """float32 [T], change of progress since the previous scored frame; 0 for the first.
+        """float32 [T], change in progress since the previous scored frame; 0 for the first.
 
         Raises ValueError if the checkpoint does not predict progress at each frame.
         """
@@ -211,10 +211,10 @@ class FrameScores:
         return np.diff(progress, prepend=progress[:1])
 
     def progress_by(self, rule: ProgressRule) -> Float32Array:
-        """Return progress by a rule, float32 [T], 0..1, from the seconds that RynnValue predicts in its place.
+        """Derive progress, float32 [T], 0..1, from the seconds that RynnValue predicts instead.
 
-        rule: ``remaining_over_first``: 1 - remaining_s / remaining_s of the first frame, within 0..1. So the scores
-            must be of one whole episode, whose first frame has progress 0
+        rule: ``remaining_over_first``: 1 - remaining_s / remaining_s at the first frame, within 0..1. So the scores
+            must cover one whole episode, whose first frame has progress 0
 
         Raises ValueError for another rule, without remaining seconds, or if they are not above 0 at the first frame.
         """
@@ -226,7 +226,7 @@ class FrameScores:
         return progress
 
     def succeeded(self, *, last: int = 1, threshold: float = SUCCESS_THRESHOLD) -> bool:
-        """True if success reaches ``threshold`` at more than half of the ``last`` frames (all, if there are fewer).
+        """True if success reaches ``threshold`` at more than half of the ``last`` frames (or all, if there are fewer).
 
         Raises ValueError if the checkpoint does not predict success, for a ``threshold`` outside 0..1 or ``last`` < 1.
         """
@@ -244,9 +244,9 @@ FRAME_SCORES: Mapping[str, Score] = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProgressResult(FrameScores):
-    """Answer to a ProgressSample: the scores of its trajectory's frames.
+    """Answer to a ProgressSample: scores for its trajectory's frames.
 
-    model_version: version of the checkpoint that answered
+    model_version: checkpoint version that answered
     """
 
     timing: BatchTiming | None = None
@@ -254,9 +254,9 @@ class ProgressResult(FrameScores):
 
     @classmethod
     def of_parts(cls, parts: Sequence[ProgressResult]) -> ProgressResult:
-        """Return one result for the frames of all parts, as ``FrameScores.joined``, without ``timing``.
+        """Return one result for all parts' frames, as ``FrameScores.joined`` does, without ``timing``.
 
-        Raises InferenceFailedError if several versions of the checkpoint answered.
+        Raises InferenceFailedError if several checkpoint versions answered.
         """
         versions = sorted({str(part.model_version) for part in parts})
         if len(versions) > 1:
@@ -267,7 +267,7 @@ class ProgressResult(FrameScores):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PreferenceResult:
-    """Answer to a PreferenceSample: the probability that ``first`` is preferred, and each frame's scores.
+    """Answer to a PreferenceSample: the probability that ``first`` is preferred, and scores for all frames.
 
     preference: if both orders were asked, their mean
     first, second, timing: from the order (first, second)
@@ -286,7 +286,7 @@ class PreferenceResult:
     def of_both_orders(cls, asked: PreferenceResult, swapped: PreferenceResult) -> PreferenceResult:
         """Return one result from the answers to a sample and to its ``swapped``.
 
-        Raises InferenceFailedError if two versions of the checkpoint answered.
+        Raises InferenceFailedError if two checkpoint versions answered.
         """
         if asked.model_version != swapped.model_version:
             got = f"{asked.model_version}, {swapped.model_version}"
@@ -307,7 +307,7 @@ class PreferenceResult:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimilarityResult:
-    """Answer to a SimilaritySample: the raw, unbounded similarity score, and each frame's scores."""
+    """Answer to a SimilaritySample: the raw, unbounded similarity score, and scores for all frames."""
 
     similarity: float
     reference: FrameScores
@@ -320,7 +320,7 @@ Result: TypeAlias = ProgressResult | PreferenceResult | SimilarityResult
 
 
 def trajectory_scores(result: Result) -> dict[str, FrameScores]:
-    """Return the scores of each trajectory by its name in the result; a single trajectory's name is empty."""
+    """Return each trajectory's scores by its name in the result; a single trajectory has an empty name."""
     if isinstance(result, ProgressResult):
         return {"": result}
     return {name: value for name, value in vars(result).items() if isinstance(value, FrameScores)}

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Samples: questions to a reward model.
 
-Letters: T frames, H x W pixels, D width of a frame embedding, Dt width of a text embedding.
-Samples check their arrays once, here; all other code relies on it."""
+Letters: T frames, H x W pixels, D frame embedding width, Dt text embedding width.
+Samples check their arrays once, here; all other code relies on it.
+"""
 
 from __future__ import annotations
 
@@ -19,26 +20,26 @@ from rfm_client.contract.errors import InvalidSampleError
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
 UInt8Array: TypeAlias = npt.NDArray[np.uint8]
-NamedFrame: TypeAlias = tuple[bytes, npt.NDArray[Any]]  # a frame's digest, and what a server has of the frame
+NamedFrame: TypeAlias = tuple[bytes, npt.NDArray[Any]]  # a frame's digest, and what a server keeps of the frame
 
 MIN_FRAME_STEPS = 2  # a prefix sampled to a single frame is no trajectory
 MOST_VIEWS = 2  # besides the frames
 MAX_FRAME_STEPS = 4096  # more frames than any checkpoint takes
-_PLAIN_NUMBERS = ("I", "F")  # Pillow's modes of depth pictures, which no conversion makes a colour picture
+_PLAIN_NUMBERS = ("I", "F")  # Pillow's modes for depth pictures, which cannot be converted to colour pictures
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Trajectory:
-    """The frames of one episode, or their embeddings, and its task.
+    """One episode's frames, or their embeddings, and its task.
 
     frames: uint8 [T, H, W, 3], RGB
-    video_embeddings: float32 [T, D], in place of ``frames``
-    text_embedding: float32 [Dt], embedding of the task, for ``video_embeddings``
+    video_embeddings: float32 [T, D], instead of ``frames``
+    text_embedding: float32 [Dt], task embedding for ``video_embeddings``
     task: a sentence, for ``frames``
-    views: with ``frames``, those of further cameras at the same times, uint8 [T, H, W, 3] each; Robo-Dopamine reads
-        those of the left and the right wrist, in this order
-    goal: with ``frames``, a picture of the task done, uint8 [H, W, 3], RGB; Robo-Dopamine reads it
-    named: in place of ``frames``, on a server: the digest of each frame with its pixels, uint8 [H, W, 3], or with its
+    views: with ``frames``: further cameras' frames at the same times, uint8 [T, H, W, 3] each; Robo-Dopamine reads the
+        left and the right wrist camera, in this order
+    goal: with ``frames``: a picture that shows the finished task, uint8 [H, W, 3], RGB; Robo-Dopamine reads it
+    named: instead of ``frames``, on a server: each frame's digest with its pixels, uint8 [H, W, 3], or with its
         embedding, float32 [D], which the encoders kept
 
     Raises InvalidSampleError.
@@ -72,7 +73,7 @@ class Trajectory:
             object.__setattr__(self, "text_embedding", text)
 
     def __repr__(self) -> str:
-        """The trajectory with shapes in place of values."""
+        """Describe the trajectory with shapes instead of values."""
         arrays = {"frames": self.frames, "video_embeddings": self.video_embeddings, "text": self.text_embedding}
         shapes = [f"{name}={array.dtype} {list(array.shape)}" for name, array in arrays.items() if array is not None]
         shapes += [f"view={array.dtype} {list(array.shape)}" for array in self.views]
@@ -94,7 +95,7 @@ class Trajectory:
 
     @property
     def num_frames(self) -> int:
-        """T, the number of frames."""
+        """T, the frame count."""
         return len(self.positions if self.named is None else self.named)
 
     def _check_views(self) -> None:
@@ -119,7 +120,7 @@ class Trajectory:
 class ProgressSample:
     """Question: how far is ``trajectory`` at each frame, and has it succeeded?
 
-    frame_steps: 0 scores the trajectory as a whole. N >= 2 is dense mode: frame t is scored on its prefix 0..t alone,
+    frame_steps: 0 scores the trajectory as a whole. N >= 2 is dense mode: frame t is scored from its prefix 0..t alone,
         sampled to N frames, as an RL loop sees it at that step
     """
 
@@ -138,7 +139,7 @@ class ProgressSample:
 
 @dataclass(frozen=True, eq=False)
 class PreferenceSample:
-    """Question: which trajectory does the task of ``first`` better?"""
+    """Question: which trajectory does ``first``'s task better?"""
 
     first: Trajectory
     second: Trajectory
@@ -154,14 +155,14 @@ class PreferenceSample:
 
     @property
     def swapped(self) -> PreferenceSample:
-        """The question with ``second`` in first place, still about the task of ``first``."""
+        """The question with ``second`` in first place, still about ``first``'s task."""
         asked = self.first
         return PreferenceSample(replace(self.second, task=asked.task, text_embedding=asked.text_embedding), asked)
 
 
 @dataclass(frozen=True, eq=False)
 class SimilaritySample:
-    """Question: how similar is ``other`` to ``reference`` in doing the task of ``reference``?"""
+    """Question: how similar is ``other`` to ``reference`` in doing ``reference``'s task?"""
 
     reference: Trajectory
     other: Trajectory
@@ -181,7 +182,7 @@ Sample: TypeAlias = ProgressSample | PreferenceSample | SimilaritySample
 
 @dataclass(frozen=True, eq=False)
 class EncoderSample:
-    """The trajectories of one sample, for an encoder.
+    """One sample's trajectories, for an encoder.
 
     The encoder reads frames and the first trajectory's task. It returns trajectories with embeddings of both.
     """
@@ -190,7 +191,7 @@ class EncoderSample:
 
 
 def check_frame_steps(steps: Any) -> None:
-    """Raise InvalidSampleError unless ``steps`` is 0 or a number of frames for dense mode."""
+    """Raise InvalidSampleError unless ``steps`` is 0 or a valid frame count for dense mode."""
     is_whole = isinstance(steps, (int, np.integer)) and not isinstance(steps, bool)
     if not is_whole or not (steps == 0 or MIN_FRAME_STEPS <= steps <= MAX_FRAME_STEPS):
         expected = f"0 or a whole number from {MIN_FRAME_STEPS} to {MAX_FRAME_STEPS}"
@@ -213,7 +214,7 @@ def stackable(trajectories: Sequence[Trajectory]) -> list[list[Trajectory]]:
 
 
 def with_trajectories(sample: Sample, trajectories: Sequence[Trajectory]) -> Sample:
-    """Return a sample that asks the same about other trajectories."""
+    """Return a sample that asks the same question about other trajectories."""
     if isinstance(sample, ProgressSample):
         return replace(sample, trajectory=trajectories[0])
     first, second = trajectories
@@ -221,7 +222,7 @@ def with_trajectories(sample: Sample, trajectories: Sequence[Trajectory]) -> Sam
 
 
 def with_pictures(trajectory: Trajectory, change: Callable[[UInt8Array], UInt8Array]) -> Trajectory:
-    """Return the trajectory with changed frames, views and goal; embeddings as they are.
+    """Return the trajectory with changed frames, views and goal; embeddings stay unchanged.
 
     change: takes and returns uint8 [T, H, W, 3]; T = 1 for the goal
     """
@@ -232,7 +233,7 @@ def with_pictures(trajectory: Trajectory, change: Callable[[UInt8Array], UInt8Ar
 
 
 def float_frames_to_uint8(frames: npt.ArrayLike) -> UInt8Array:
-    """Return uint8 frames from float frames in 0..255 of the same shape: clip and truncate, as upstream's server does.
+    """Return uint8 frames from float frames in 0..255, same shape: clip and truncate, as upstream's server does.
 
     Raises InvalidSampleError for frames in 0..1, which truncation would turn black, and for NaN, Inf or no values.
     """
@@ -248,7 +249,7 @@ def float_frames_to_uint8(frames: npt.ArrayLike) -> UInt8Array:
 def as_array(values: Any) -> npt.NDArray[Any]:
     """Return the values as an array; torch tensors too, on a GPU or with a gradient, bfloat16 as float32.
 
-    Raises ValueError for rows of unequal length, InvalidSampleError for a picture of Pillow whose numbers are not RGB.
+    Raises ValueError for rows of unequal length, InvalidSampleError for a Pillow picture whose numbers are not RGB.
     """
     if isinstance(values, (list, tuple)) and values and (hasattr(values[0], "detach") or hasattr(values[0], "getexif")):
         values = [as_array(each) for each in values]
@@ -326,7 +327,7 @@ def _check_text(trajectory: Trajectory, where: str) -> None:
 
 
 def _check_pair(first: Trajectory, second: Trajectory, where: str) -> None:
-    """Check that both are of one kind. Embeddings need one width; frames may differ in size."""
+    """Check that both are frames or both embeddings. Embeddings need one width; frames may differ in size."""
     if not isinstance(second, Trajectory):
         raise InvalidSampleError.at(where, "Trajectory", type(second).__name__)
     for each in (first, second):
@@ -347,11 +348,11 @@ Widths: TypeAlias = tuple[int, int] | None
 
 BLANK_FRAMES = 2
 SIDE_PX = 64
-PROBE_TASK = "probe"  # of a blank trajectory
+PROBE_TASK = "probe"  # task for a blank trajectory
 
 
 def blank_trajectory(widths: Widths, task: str = PROBE_TASK) -> Trajectory:
-    """Return BLANK_FRAMES embeddings, or frames, of zeros."""
+    """Return BLANK_FRAMES all-zero embeddings or frames."""
     if widths is None:
         return Trajectory(frames=np.zeros((BLANK_FRAMES, SIDE_PX, SIDE_PX, 3), np.uint8), task=task)
     video_dim, text_dim = widths

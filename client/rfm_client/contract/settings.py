@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Settings: frozen dataclasses whose fields have a help text and bounds, for files and command lines."""
+"""Settings: frozen dataclasses whose fields carry help texts and bounds, for files and command lines."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from rfm_client.contract.errors import InvalidValueError
 
 Texts: TypeAlias = tuple[str, ...]
 
-_PLAIN: dict[Any, tuple[type, ...]] = {Path: (str,), float: (int, float), Texts: (list,)}  # else the type itself
+_PLAIN: dict[Any, tuple[type, ...]] = {Path: (str,), float: (int, float), Texts: (list,)}  # otherwise the type itself
 _PLACEHOLDERS: dict[Any, str | None] = {Path: "PATH", list[Path]: "PATH", int: "N", float: "NUMBER", bool: None}
-_UNBOUNDED = 2**31 - 1  # a bound that only the number's type sets
+_UNBOUNDED = 2**31 - 1  # a bound set only by the number's type
 _NAMES: dict[Any, str] = {types.NoneType: "null", Path: "str", Texts: "list of str"}
 
 
 class ConfigError(InvalidValueError):
     """An invalid setting, or two settings that do not fit together.
 
-    where: name of the setting
-    other: name of the second setting; empty: none
+    where: the setting's name
+    other: the second setting's name; empty: none
     """
 
     other = ""
 
     @classmethod
     def of_two(cls, name: str, relation: str, other: str) -> ConfigError:
-        """Return the error of two settings: ``name needs other``, for example."""
+        """Return the error for two settings: ``name needs other``, for example."""
         return cls.like(cls(relation, name), other=other)
 
     @classmethod
     def require_both(cls, settings: object, name: str, other: str) -> None:
-        """Raise the error of a pair of settings of which only one is given."""
+        """Raise ConfigError if only one setting in a pair is given."""
         for given, missing in ((name, other), (other, name)):
             if getattr(settings, given) is not None and getattr(settings, missing) is None:
                 raise cls.of_two(given, "needs", missing)
 
     def named(self, name_of: Callable[[str], str]) -> ConfigError:
-        """Return the error under the names that the settings have elsewhere."""
+        """Return the error with the settings renamed, as they are called elsewhere."""
         return self.like(self, where=name_of(self.where), other=name_of(self.other) if self.other else "")
 
     def __str__(self) -> str:
@@ -55,13 +55,13 @@ class ConfigError(InvalidValueError):
 class Setting:
     """One field of a ``Settings``.
 
-    default: ``MISSING``: the setting must be given
+    default: ``MISSING``: the setting is required
     title: heading in a command's help
     least, most: bounds of a number
-    flag, prefix: option on a command line, and the beginning of all options; flag None: made from ``name``
-    metavar: placeholder for the value in a command's help; None: made from ``kind``
+    flag, prefix: command-line option, and the prefix for all options; flag None: derived from ``name``
+    metavar: placeholder for the value in a command's help; None: derived from ``kind``
     variable: environment variable for the value
-    parse: converts the text on a command line to the value; raises ValueError
+    parse: converts command-line text to the value; raises ValueError
     has_option: False: only files and programs set it
     """
 
@@ -81,7 +81,7 @@ class Setting:
 
     @property
     def option(self) -> str:
-        """The option of this setting."""
+        """The command-line option for this setting."""
         return f"--{self.prefix}{self._flag}"
 
     @property
@@ -90,14 +90,14 @@ class Setting:
         return f"--{self.prefix}no-{self._flag}"
 
     def from_plain(self, value: Any) -> Any:
-        """Convert a plain value of YAML or JSON. Raises ConfigError for a wrong type."""
+        """Convert a plain YAML or JSON value. Raises ConfigError for a wrong type."""
         for kind in self._kinds:
             if _spells(value, kind):
                 return None if value is None else kind(value)
         raise ConfigError.at(self.name, self._expected, f"{value!r:.200}")
 
     def checked(self, value: Any) -> Any:
-        """Return the value, a number as Python's own. Raises InvalidValueError: out of bounds, or no choice."""
+        """Return the value, numbers as Python's own. Raises InvalidValueError if out of bounds or not a choice."""
         if value is None:
             return None
         require(self.name, not self._choices or value in self._choices, self._expected, f"{value!r:.200}")
@@ -111,12 +111,12 @@ class Setting:
 
     @property
     def placeholder(self) -> str | None:
-        """What stands for the value in a command's help; None for a flag."""
+        """The value's placeholder in a command's help; None for a flag."""
         return self.metavar or placeholder_of(self.kind)
 
     @property
     def bounds(self) -> str:
-        """Bounds of a number in words; empty without bounds."""
+        """Bounds of a number, in words; empty without bounds."""
         if self.least is None:
             return ""
         has_most = self.most is not None and self.most < _UNBOUNDED
@@ -143,16 +143,16 @@ class Setting:
 
 
 def setting(default: Any, help: str, **more: Any) -> Any:
-    """Return a field of a ``Settings``; ``more`` are fields of ``Setting``. default: ``...``: it must be given"""
+    """Return a field for a ``Settings``; ``more`` are ``Setting`` fields. default: ``...``: required."""
     metadata = {"help": help, **more}
     return field(kw_only=True, metadata=metadata) if default is ... else field(default=default, metadata=metadata)
 
 
 class Settings:
-    """Base of frozen dataclasses whose fields are made by ``setting``. Raises ConfigError for an invalid value.
+    """Base class for frozen dataclasses with fields from ``setting``. Raises ConfigError for an invalid value.
 
-    TITLE: heading of the options in a command's help; options of a base class stand under the base's heading
-    PREFIX: before the name of each option
+    TITLE: heading for the options in a command's help; inherited options stand under the base class's heading
+    PREFIX: prefix for every option name
     NO_OPTION: settings without an option, which only files and programs set
     """
 
@@ -169,7 +169,7 @@ class Settings:
 
     @classmethod
     def settings(cls) -> dict[str, Setting]:
-        """Return the settings by name, in their order."""
+        """Return the settings by name, in declaration order."""
         kind: Any = cls  # a dataclass
         hints, found = typing.get_type_hints(kind), {}
         for each in fields(kind):
@@ -180,13 +180,13 @@ class Settings:
 
 
 def placeholder_of(kind: Any) -> str | None:
-    """Return what stands for a value of this type in a command's help: ``PATH``, ``N``, choices; None for a flag."""
+    """Return the help placeholder for a type: ``PATH``, ``N``, or the choices; None for a flag."""
     (part,) = (each for each in _parts_of(kind) if each is not types.NoneType)
     return "|".join(_choices_of(kind)) or _PLACEHOLDERS.get(part, "TEXT")
 
 
 def _parts_of(kind: Any) -> tuple[Any, ...]:
-    """The types of a union, or the type."""
+    """Return a union's types, or the type itself."""
     return typing.get_args(kind) if typing.get_origin(kind) in (types.UnionType, typing.Union) else (kind,)
 
 
@@ -196,6 +196,6 @@ def _choices_of(kind: Any) -> Texts:
 
 
 def _spells(value: Any, kind: Any) -> bool:
-    """True if a plain value has this type. Not isinstance, for which True is an int."""
+    """True if a plain value has this type. isinstance would accept True as an int."""
     is_plain = type(value) in _PLAIN.get(kind, (kind,))
     return is_plain and (kind != Texts or all(type(each) is str for each in value))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Translation of Triton's and tritonclient's errors into RewardErrors.
+"""Translate Triton's and tritonclient's errors into RewardErrors.
 
-A status is text, as tritonclient gives it: a name from gRPC, a number from HTTP. tests/triton/test_wording.py makes a
-real Triton say each of its phrases.
+A status is text, as in tritonclient: a name over gRPC, a number over HTTP. tests/triton/test_wording.py makes a real
+Triton produce all these phrases.
 """
 
 from __future__ import annotations
@@ -32,26 +32,26 @@ _ERRORS: dict[tuple[str, ...], type[errors.RewardError]] = {
     ("StatusCode.INVALID_ARGUMENT", "400"): errors.InvalidSampleError,
     ("StatusCode.NOT_FOUND", "404"): errors.ModelNotFoundError,
     UNAVAILABLE: errors.ServerUnavailableError,
-    CANCELLED: errors.ServerUnavailableError,  # not by the client: the server is stopping
+    CANCELLED: errors.ServerUnavailableError,  # not cancelled by the client: the server is stopping
     BAD_GATEWAY: errors.ServerUnavailableError,
     OUT_OF_TIME: errors.DeadlineExceededError,
 }
 _ERROR_OF = {status: error for statuses, error in _ERRORS.items() for status in statuses}
 
 PROCESS_ENDED = "is not healthy"  # "Stub process 'rfm_0_0' is not healthy."
-NO_VERSIONS = "no available versions"  # the model failed, or is being loaded again
+NO_VERSIONS = "no available versions"  # the model failed, or is reloading
 LOST_REGION = "Unable to find shared memory region"  # the server was restarted
-REGION_IN_USE = "it is currently in use"  # a region to unmap
+REGION_IN_USE = "it is currently in use"  # while unmapping a region
 RESTRICTED = "is restricted, expecting header"  # the API needs a key
 
-_NO_CONNECTION = re.compile(  # gRPC's own words: nothing was sent
+_NO_CONNECTION = re.compile(  # gRPC's own messages: nothing was sent
     "failed to connect|connections to all backends failing|errors resolving|resolution failed"
 )
-_REASON = re.compile(r"(?:: |\[)((?:Connection|Domain name|Name|No route|Network)[\w ]+)\]?$")  # of a libc or gRPC
-_PROXY_ALONE = "http2 header with status: 502"  # a proxy answered: the server behind it did not
+_REASON = re.compile(r"(?:: |\[)((?:Connection|Domain name|Name|No route|Network)[\w ]+)\]?$")  # from libc or gRPC
+_PROXY_ALONE = "http2 header with status: 502"  # a proxy answered, but the server behind it did not
 _LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # or a proxy's
 _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|{RESTRICTED}")
-_WRONG_SHAPE = re.compile(  # without the batch axis, which the caller did not make
+_WRONG_SHAPE = re.compile(  # without the batch axis, which the caller did not add
     r"unexpected shape for input '(?P<name>\w+)'.*?Expected \[-1,(?P<expected>[^\]]*)\], got \[\d+,(?P<got>[^\]]*)\]"
 )
 _NO_INPUT = re.compile(
@@ -64,13 +64,13 @@ _OF_VIEWS = (
     "leave out views and goal",
 )
 _OLD = "one that was exported before there was this input"
-# By optional input: a model that has it, one that has not, and the remedy.
+# By optional input: a model that has it, one that lacks it, and the remedy.
 _WITHOUT = {
     SECOND_FRAMES: ("a model that takes pairs of two frame sizes", _OLD, "export it again, or resize a trajectory"),
     **dict.fromkeys((*VIEWS, GOAL), _OF_VIEWS),
 }
 _NO_OUTPUT = re.compile(r"unexpected inference output '(\w+)'")
-_FIELDS = re.compile(r"(\S+): expected (.*?), got (.*)", re.DOTALL)  # as ``LocatedError`` writes them
+_FIELDS = re.compile(r"(\S+): expected (.*?), got (.*)", re.DOTALL)  # as written by ``LocatedError``
 _PREFIX = re.compile(r"^(\[request id: [^\]]*\] )?(in ensemble '[^']*', )?")  # the caller knows both
 
 FEWER_FRAMES = "score some of them (subsample=True), each on few before it (frame_steps), or by a sampling rule"
@@ -87,7 +87,7 @@ _TRUST = {
 
 
 def invalid_sample(text: str) -> errors.InvalidSampleError:
-    """Return the error with its fields, which the server sent as text."""
+    """Return the error, with fields parsed from the server's text."""
     output = _NO_OUTPUT.search(text)
     if output is not None:
         return errors.InvalidSampleError(text, output[1])
@@ -106,17 +106,17 @@ def error_from(
     proxy: str | None = None,
     bad_request: BadRequest = invalid_sample,
 ) -> errors.RewardError | None:
-    """Translate an exception of tritonclient or of a library below it; None: another exception.
+    """Translate an exception from tritonclient or a library below it; None: any other exception.
 
-    proxy: proxy of the call (``grpc_proxy``)
+    proxy: the call's proxy (``grpc_proxy``)
     bad_request: makes the error for the status INVALID_ARGUMENT, which Triton also gives for an unknown model
     """
     where = f"{url} through {proxy}" if proxy else url
-    for kind in type(raised).__mro__:  # by name, since these libraries may not be imported
+    for kind in type(raised).__mro__:  # by name, because these libraries may not be imported
         match kind.__name__:
             case "InferenceServerException":
                 return _error_of_answer(raised, url, proxy, bad_request)
-            case "TimeoutError":  # asyncio has its own class in Python 3.10
+            case "TimeoutError":  # in Python 3.10 asyncio has its own class
                 late = errors.DeadlineExceededError(f"{where}: no answer in time")
                 late.server = where
                 return late
@@ -127,7 +127,7 @@ def error_from(
             case "ClientConnectorError" | "OSError" | "EOFError" | "HTTPException":
                 number = getattr(raised, "errno", None) or 0
                 return unreachable(url, os.strerror(number) if number > 0 else str(raised) or type(raised).__name__)
-            case "ClientError":  # aiohttp's, after the request was sent
+            case "ClientError":  # from aiohttp, after the request was sent
                 lost = unreachable(url, str(raised) or type(raised).__name__)
                 lost.may_have_ended_server = True
                 return lost
@@ -173,7 +173,7 @@ def is_redirect(status: int) -> bool:
 
 
 def redirected(url: str, location: str) -> errors.InferenceFailedError:
-    """Return the error of a redirect, which no call follows. location: as in the answer's header"""
+    """Return the error for a redirect, which no call follows. location: from the answer's header."""
     target = urljoin(url, location)
     return errors.InferenceFailedError(
         f"{url}: expected an answer of Triton, got a redirect to {target!r:.200}: give that server's address as URL if "
@@ -187,7 +187,7 @@ def is_denied(status: str, message: str) -> bool:
 
 
 def denied(url: str, status: str, message: str) -> errors.AccessDeniedError:
-    """Return the error of a refused connection or request, with its remedy."""
+    """Return the error for a refused connection or request, with its remedy."""
     is_keyed = status in DENIED or RESTRICTED in message
     fitting = (remedy for words, remedy in _TRUST.items() if re.search(words, message))
     remedy = _SHOW_KEY if is_keyed else next(fitting, "")
@@ -195,7 +195,7 @@ def denied(url: str, status: str, message: str) -> errors.AccessDeniedError:
 
 
 def unreachable(url: str, reason: str, proxy: str | None = None) -> errors.ServerUnavailableError:
-    """Return the error of a failed connection to the server, or to its proxy."""
+    """Return the error for a failed connection to the server or its proxy."""
     told = _REASON.search(reason)
     reason = told[1] if told else reason
     if proxy is None:
@@ -205,7 +205,7 @@ def unreachable(url: str, reason: str, proxy: str | None = None) -> errors.Serve
 
 
 def not_served(model: str, message: str, served: Collection[str]) -> errors.ModelNotFoundError:
-    """Return the error of a missing model, with the names of the served models and the remedy."""
+    """Return the error for a missing model, with the served models' names and the remedy."""
     takes_frames = frames_name(model) in served
     remedy = (
         "this checkpoint takes no embeddings: give frames, and ask model_info(frames=True)" if takes_frames else _NAME

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Episodes that grow: each step sends only its new frames, and returns the score of the episode so far."""
+"""Episodes that grow: each step sends only new frames, and returns the score for the episode so far."""
 
 from rfm_client.episodes.episodes import AsyncEpisode, AsyncEpisodes, Episode, Episodes
 from rfm_client.episodes.options import EpisodeOptions, FrameOptions, StepScore, SuccessRule

@@ -29,11 +29,11 @@ from rfm_client.transport.threads import AsyncClosing, Closing, LoopThread, OneP
 class AsyncEpisodes(AsyncClosing, OneProcess):
     """N episodes in step, as in vectorised environments. An async context manager.
 
-    A step needs as few requests as possible. Episodes keep all frames until they end, because later steps show them
+    A step sends as few requests as possible. Episodes keep all frames until they end, because later steps show them
     again.
 
-    begin: client method to start a call now
-    steps: each episode
+    begin: client method that starts a call now
+    steps: one entry per episode
     """
 
     def __init__(self, scorer: StepScorer, begin: Callable[[CallOptions], Call], steps: list[Steps]) -> None:
@@ -95,7 +95,7 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
         return (await self._scorer.model_info(call or self._begin(self._timed))).frame_size
 
     async def _checked(self, frames: Any, indices: Sequence[int], size: FrameSize | None) -> list[tuple[Frame, ...]]:
-        """Check the new frames of these episodes, in as many threads as processors."""
+        """Check these episodes' new frames, with at most one thread per processor."""
         given = self._given(frames, indices)
 
         def checked(some: Sequence[int]) -> list[tuple[Frame, ...]]:
@@ -108,7 +108,7 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
         return [frame for part in making for frame in part.result()]
 
     def _given(self, frames: Any, indices: Sequence[int]) -> dict[int, Any]:
-        """The new frame for each episode; with cameras, a dict."""
+        """Return the new frame for each episode; with cameras, a dict."""
         cameras = self._options.cameras
         check_cameras("frames", frames, cameras)
         of_cameras = {f"frames[{camera!r}]": frames[camera] for camera in cameras} or {"frames": frames}
@@ -120,7 +120,7 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
         return {index: {camera: frames[camera][index] for camera in cameras} for index in indices}
 
     def _gathered(self, scores: Mapping[int, StepScore]) -> StepScores:
-        """The scores of all episodes; NaN and False where there is none."""
+        """Return scores for all episodes; NaN and False where there is none."""
         progress, success = (np.full(len(self), np.nan, np.float32) for _ in range(2))
         succeeded = np.zeros(len(self), bool)
         more: dict[str, npt.NDArray[Any]] = {}
@@ -138,14 +138,14 @@ class AsyncEpisode(AsyncClosing, OneProcess):
     """One episode that grows, for asyncio. ``AsyncRewardClient.episode`` builds it. An async context manager."""
 
     def __init__(self, episodes: AsyncEpisodes) -> None:
-        self.episodes = episodes  # a single one
+        self.episodes = episodes  # holds a single episode
         self._open: asyncio.Task[StepScore] | None = None
-        self._waiting: asyncio.Task[StepScore] | None = None  # for the open request to end
+        self._waiting: asyncio.Task[StepScore] | None = None  # waits for the open request to end
 
     async def add(self, frame: Any) -> StepScore:
         """Add a frame, and score the episode so far.
 
-        Waits for an open request. Drops a frame from ``add_nowait`` if one waits, too.
+        Waits for an open request. Also drops a waiting frame from ``add_nowait``.
 
         frame: uint8 [H, W, 3]; with cameras, a dict
 
@@ -158,7 +158,7 @@ class AsyncEpisode(AsyncClosing, OneProcess):
         """Add a frame, as in ``add``, and return a future score.
 
         While a request is open, the frame waits. A newer frame replaces it, and cancels its future. A frame with a
-        cancelled future is not part of the episode.
+        cancelled future does not join the episode.
         """
         frame = copied(frame)
         if self._open is None or (self._open.done() and self._waiting is None):
@@ -208,15 +208,15 @@ class Episodes(Closing, OneProcess):
         return len(self._episodes)
 
     def add(self, frames: Any, mask: npt.ArrayLike | None = None) -> StepScores:
-        """Add a frame to each episode, and return the scores, as ``AsyncEpisodes.add``. Raises RewardError."""
+        """Add a frame to each episode, and return the scores, like ``AsyncEpisodes.add``. Raises RewardError."""
         return self._loop.wait(self._episodes.add(frames, mask))
 
     def reset(self, mask: npt.ArrayLike | None = None, task: str | Sequence[str] | None = None) -> None:
-        """Begin new episodes, as ``AsyncEpisodes.reset``. mask: bool [N]."""
+        """Begin new episodes, like ``AsyncEpisodes.reset``. mask: bool [N]."""
         self._loop.wait(self._episodes.reset(mask, task))
 
     def close(self) -> None:
-        """End the episodes, as ``AsyncEpisodes.close``."""
+        """End the episodes, like ``AsyncEpisodes.close``."""
         self._loop.wait(self._episodes.close())
 
 
@@ -228,8 +228,8 @@ class Episode(Closing, OneProcess):
 
     def __init__(self, episode: AsyncEpisode, loop: LoopThread, client: object) -> None:
         self._episode, self._loop, self._client = episode, loop, client
-        self._size: FrameSize | None = None  # to which ``keep`` shrinks frames
-        self._is_queued = False  # a request of ``add_nowait`` may be open
+        self._size: FrameSize | None = None  # ``keep`` shrinks frames to this size
+        self._is_queued = False  # an ``add_nowait`` request may be open
 
     @property
     def asked(self) -> Asked:
@@ -239,13 +239,13 @@ class Episode(Closing, OneProcess):
 
     @property
     def step(self) -> int:
-        """Number of the newest frame, from 0; -1: none yet."""
+        """The newest frame's index, from 0; -1: none yet."""
         return self.asked[1]
 
     def keep(self, frame: Any) -> None:
-        """Add a frame, and ask nothing: ``RewardClient.score_episodes`` scores it. frame: as in ``add``.
+        """Add a frame without a request: ``RewardClient.score_episodes`` scores it. frame: as in ``add``.
 
-        Raises InvalidSampleError; RewardError if the server does not tell the size for ``resize``.
+        Raises InvalidSampleError; RewardError if the server does not report the size for ``resize``.
         """
         steps, newest = self.asked
         if newest < 0 and steps.options.resize:
@@ -253,11 +253,11 @@ class Episode(Closing, OneProcess):
         steps.append(steps.checked(frame, self._size))
 
     def add(self, frame: Any) -> StepScore:
-        """Add a frame, uint8 [H, W, 3], and return the score, as ``AsyncEpisode.add``. Raises RewardError."""
+        """Add a frame, uint8 [H, W, 3], and return the score, like ``AsyncEpisode.add``. Raises RewardError."""
         return self._loop.wait(self._episode.add(frame))
 
     def add_nowait(self, frame: Any) -> Future[StepScore]:
-        """Add a frame, and return the future of its score at once, as ``AsyncEpisode.add_nowait``."""
+        """Add a frame, and return a future score at once, like ``AsyncEpisode.add_nowait``."""
         frame = copied(frame)
         self._is_queued = True
 
@@ -267,17 +267,17 @@ class Episode(Closing, OneProcess):
         return self._loop.start(answer())
 
     def reset(self, task: str | None = None) -> None:
-        """Begin a new episode, as ``AsyncEpisode.reset``. ``task``: None: as before."""
+        """Begin a new episode, like ``AsyncEpisode.reset``. ``task``: None: as before."""
         self._loop.wait(self._episode.reset(task))
 
     def close(self) -> None:
-        """End the episode, as ``AsyncEpisode.close``."""
+        """End the episode, like ``AsyncEpisode.close``."""
         if self._is_queued:
             self._loop.wait(self._episode.close())
 
 
 def _indices(mask: npt.ArrayLike | None, count: int) -> list[int]:
-    """Indices of the episodes in a mask. Raises ValueError unless it is bool [count]."""
+    """Return the indices of the episodes in a mask. Raises ValueError unless it is bool [count]."""
     if mask is None:
         return list(range(count))
     return [int(index) for index in np.flatnonzero(checked_mask("mask", mask, count))]

@@ -22,12 +22,12 @@ StepValue: TypeAlias = Literal["progress", "remaining_s"]
 
 @dataclass(frozen=True)
 class StepScore:
-    """The score of one episode at its newest frame.
+    """One episode's score at its newest frame.
 
     progress: share of the task done, 0..1; NaN with ``score="remaining_s"`` if the checkpoint does not predict progress
     success: probability that the task is done; NaN: the checkpoint does not predict success
     succeeded: True if the success rule holds; False where success is NaN
-    step: index of the scored frame in the episode, from 0
+    step: the scored frame's index in the episode, from 0
     ms: milliseconds to the answer, without the wait for an open ``add_nowait`` request
     more_scores: other scores for the frame, by name in ``FRAME_SCORES``: marks as bool, numbers as float. With several
         cameras, numbers are fused, and a mark is True if any camera has it
@@ -46,18 +46,18 @@ class StepScore:
         return bool(self.more_scores.get("unclear"))
 
     def value(self, score: StepValue) -> float:
-        """Return the number that grows as the task is done: progress, or minus the remaining seconds."""
+        """Return the number that grows towards task completion: progress, or minus the remaining seconds."""
         return self.progress if score == "progress" else -self.more_scores[score]
 
 
 @dataclass(frozen=True, eq=False)
 class StepScores:
-    """The scores of N episodes at the newest frames.
+    """Scores for N episodes at their newest frames.
 
     progress, success: float32 [N], as in StepScore; NaN where ``mask`` left an episode out
     succeeded: bool [N]; False where ``mask`` left an episode out, or success is NaN
-    step: int64 [N], index of the newest frame, from 0; -1: none yet
-    ms: time to the answer, milliseconds
+    step: int64 [N], the newest frame's index, from 0; -1: none yet
+    ms: time to the answer, in milliseconds
     more_scores: by name an array [N], as in StepScore: bool for marks, else float32 with NaN where there is none
     """
 
@@ -74,7 +74,7 @@ class StepScores:
         return self.more_scores.get("unclear", np.zeros(len(self.progress), bool))
 
     def of(self, index: int) -> StepScore:
-        """Return the score of one episode."""
+        """Return one episode's score."""
         numbers = float(self.progress[index]), float(self.success[index])
         more = {name: values[index].item() for name, values in self.more_scores.items()}
         return StepScore(*numbers, bool(self.succeeded[index]), int(self.step[index]), self.ms, more)
@@ -84,8 +84,8 @@ class StepScores:
 class SuccessRule:
     """A step succeeds if most of the last distinct frames in the sample reach ``threshold``.
 
-    threshold: least success of such a frame, 0..1
-    last: number of voting frames; each distinct frame votes once, even if it is repeated or padded
+    threshold: lowest success that such a frame needs, 0..1
+    last: how many frames vote; each distinct frame votes once, even if it is repeated or padded
 
     Raises ValueError.
     """
@@ -99,7 +99,7 @@ class SuccessRule:
 
 
 class StepKeywords(TypedDict, total=False):
-    """The fields of EpisodeOptions, as keyword arguments."""
+    """EpisodeOptions fields as keyword arguments."""
 
     sampling: Rule | None
     frames: int | None
@@ -115,7 +115,7 @@ class StepKeywords(TypedDict, total=False):
 
 @dataclass(frozen=True, kw_only=True)
 class FrameOptions:
-    """How the frames of an episode are read. Raises ValueError for contradictory options.
+    """How to read an episode's frames. Raises ValueError for contradictory options.
 
     sampling: a rule in ``rfm_client.frames.sampling``; None: as in training
     cameras: camera names, one frame each per step; empty: a single camera without a name
@@ -125,8 +125,8 @@ class FrameOptions:
     channels: colour order in the given frames, ``rgb`` or ``bgr``: one for all cameras, or a dict by camera
     resize: True: shrink frames to the checkpoint's size before they are kept and sent (needs Pillow); ReWiND's scores
         then differ slightly
-    score: the score to make rewards from, ``progress`` or ``remaining_s``; a step raises ValueError if the checkpoint
-        does not predict it
+    score: the score that rewards are made from, ``progress`` or ``remaining_s``; a step raises ValueError if the
+        checkpoint does not predict it
     """
 
     sampling: Rule | None = None
@@ -156,16 +156,16 @@ class FrameOptions:
 
     @property
     def corrections(self) -> list[Correction]:
-        """Correction for each camera, in camera order."""
+        """One correction per camera, in camera order."""
         return [Correction.of(camera, self.orient, self.channels) for camera in self.cameras or ("",)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeOptions(FrameOptions):
-    """How each step of an episode is scored. Raises ValueError for contradictory options.
+    """How to score each step in an episode. Raises ValueError for contradictory options.
 
-    frames: number of frames for the rule; None: fixed by the rule, else ``ModelInfo.max_frames``. If neither gives a
-        number, the first step raises ValueError
+    frames: frame count for the rule; None: fixed by the rule, else ``ModelInfo.max_frames``. If neither gives a
+        count, the first step raises ValueError
     success: decides whether a step succeeds
     timeout_s: time limit for a step with all retries; None: the client's
     """
@@ -179,9 +179,9 @@ class EpisodeOptions(FrameOptions):
         Sampling.of(self.sampling, self.frames, trained_frames=1)  # raises ValueError; 1 stands in for the checkpoint's
 
     def sampling_for(self, info: ModelInfo) -> Sampling:
-        """Return the rule and number of frames for a checkpoint.
+        """Return the rule and frame count for a checkpoint.
 
-        Raises ValueError without a needed number, InvalidSampleError if the checkpoint needs the whole episode.
+        Raises ValueError without a needed count, InvalidSampleError if the checkpoint needs the whole episode.
         """
         info.check_scores_prefixes()
         return Sampling.of(self.sampling, self.frames, info.max_frames, trained_padding=info.trained_padding)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Scores of steps, by progress requests that send only the frames that the server lacks.
+"""Score steps through progress requests that send only the frames that the server lacks.
 
-A server may lack more frames than expected: it restarted, dropped frames, or is another server. Then it refuses, and
-all pixels are sent. In both cases the answer equals that for a ``ProgressSample`` of the same frames.
+A server may lack more frames than expected: it restarted, dropped frames, or is another server. It then refuses, and
+all pixels are sent. Either way, the answer equals that for a ``ProgressSample`` with the same frames.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from rfm_client.frames.blank_frames import FRAMES_IN_A_ROW
 from rfm_client.scoring.samples import Call, SampleScorer, for_each
 from rfm_client.transport.threads import off_loop
 
-MAX_NEW_BYTES = 3 * 2**20  # of a request's frames: the server prepares a request while the next is sent
+MAX_NEW_BYTES = 3 * 2**20  # frame bytes per request: the server prepares a request while the next is sent
 MAX_REMEMBERED = 2**17  # digests of sent frames; the oldest are forgotten
 
 
-Asked: TypeAlias = tuple[Steps, int]  # an episode, and the number of the step to score
+Asked: TypeAlias = tuple[Steps, int]  # an episode, and the step to score
 
 
 class _Server:
-    """Digests of the frames that one server has received. number: index of the server"""
+    """Frame digests that one server has received. number: the server's index."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -61,23 +61,23 @@ class _Server:
 class StepScorer:
     """Scores steps for one client, in its event loop. A new episode goes to the server with the fewest episodes.
 
-    model: name of the exported model
+    model: the exported model's name
     """
 
     def __init__(self, model: str, scorer: SampleScorer, num_servers: int) -> None:
         self._model = frames_name(model)
         self._scorer = scorer
         self._servers = [_Server(number) for number in range(num_servers)]
-        self._server_of: WeakKeyDictionary[object, _Server] = WeakKeyDictionary()  # of each episode that goes on
+        self._server_of: WeakKeyDictionary[object, _Server] = WeakKeyDictionary()  # for each running episode
 
     async def model_info(self, call: Call) -> ModelInfo:
-        """Return the description of the model that scores windows. Raises RewardError."""
+        """Describe the model that scores windows. Raises RewardError."""
         return await self._scorer.model_info(self._model, call.deadline)
 
     async def scores(self, asked: Sequence[Asked], call: Call, asked_s: float) -> list[StepScore]:
-        """Return the score of each step, from as few requests as possible. Raises RewardError, ValueError.
+        """Return a score for each step, from as few requests as possible. Raises RewardError, ValueError.
 
-        asked_s: start of the caller's wait, by ``time.perf_counter``
+        asked_s: when the caller began to wait, by ``time.perf_counter``
         """
         info = await self.model_info(call)
         shown = [steps.windows(step, info) for steps, step in asked]
@@ -96,7 +96,7 @@ class StepScorer:
                 self._scorer.tell_of_blank([frame.pixels for frame in frames])
         if not info.by_digest:
             return await self._whole(windows, call)
-        num_new = sum(w.num_bytes // len(w.frames) for w in windows)  # about one frame of each window is new
+        num_new = sum(w.num_bytes // len(w.frames) for w in windows)  # about one frame in each window is new
         await off_loop(num_new, lambda: [frame.digest for window in windows for frame in window.frames])
         outcomes: dict[int, Result | RewardError] = {}
         parts = list(self._parts(windows, info.max_batch_size))
@@ -108,10 +108,10 @@ class StepScorer:
         return [outcomes[index] for index in range(len(windows))]
 
     def _parts(self, windows: Sequence[Window], limit: int) -> Iterator[list[int]]:
-        """Indices of the windows of each request.
+        """Yield window indices for each request.
 
         A request has frames of one size, for one server, at most ``limit`` windows, and at most MAX_NEW_BYTES unless a
-        window alone has more.
+        single window has more.
         """
         servers = [self._server(window) for window in windows]
 
@@ -155,7 +155,7 @@ class StepScorer:
         return results
 
     def _server(self, window: Window) -> _Server:
-        """Return the server of a window's episode; of a new episode, one with the fewest episodes."""
+        """Return the server for a window's episode; a new episode gets one with the fewest episodes."""
         if window.episode not in self._server_of:
             counts = Counter(self._server_of.values())
             fewest = min(counts[server] for server in self._servers)
@@ -186,5 +186,5 @@ class StepScorer:
 
 
 def _padded_bytes(num_windows: int, num_frames: int, frame_bytes: int) -> int:
-    """Bytes of a request's frames, which are spread evenly over its windows, with padding."""
+    """Return how many bytes a request's frames take, spread evenly over its windows, with padding."""
     return num_windows * -(-num_frames // num_windows) * frame_bytes

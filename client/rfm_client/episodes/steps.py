@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The steps of one episode: frames, scored windows, and scores. H x W pixels."""
+"""One episode's steps: frames, scored windows, and scores. H x W pixels."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Frame:
 
     @cached_property
     def digest(self) -> bytes:
-        """Digest by which a server knows the frame. The first call takes about 2 ms a megabyte."""
+        """Digest by which a server knows the frame. The first call takes about 2 ms per megabyte."""
         return wire.frame_digest(self.pixels)
 
 
@@ -38,7 +38,7 @@ class Frame:
 class Window:
     """Frames of one size and a task, to be scored for progress. Raises InvalidSampleError for an invalid task.
 
-    episode: identifies the episode; all windows of an episode go to one server
+    episode: identifies the episode; all windows in an episode go to one server
     """
 
     frames: tuple[Frame, ...]
@@ -52,7 +52,7 @@ class Window:
 
     @property
     def num_bytes(self) -> int:
-        """Bytes of all its frames."""
+        """Total bytes in all frames."""
         return sum(frame.pixels.nbytes for frame in self.frames)
 
     @property
@@ -63,12 +63,12 @@ class Window:
 
     @property
     def digests(self) -> list[bytes]:
-        """The digest of each frame."""
+        """The frames' digests, in order."""
         return [frame.digest for frame in self.frames]
 
 
 class Steps:
-    """The frames of one episode so far.
+    """One episode's frames so far.
 
     where: name in errors, such as ``episodes[3]``; empty: no name
     """
@@ -81,15 +81,15 @@ class Steps:
 
     @property
     def newest(self) -> int:
-        """Number of the newest step, from 0; -1: none yet."""
+        """The newest step's index, from 0; -1: none yet."""
         return len(self._frames) - 1
 
     def anew(self, task: str | None) -> Steps:
-        """Return the next episode, without frames. task: None: as before"""
+        """Return the next episode, without frames. task: None: as before."""
         return Steps(self.task if task is None else task, self.options, self._where)
 
     def checked(self, frame: Any, size: FrameSize | None = None) -> tuple[Frame, ...]:
-        """Return a copy of the next frame of each camera, upright. Raises InvalidSampleError.
+        """Copy the next frame from each camera, upright. Raises InvalidSampleError.
 
         frame: uint8 [H, W, 3]; with cameras, a dict
         size: target size; None: no change
@@ -124,7 +124,7 @@ class Steps:
     def windows(self, step: int, info: ModelInfo) -> tuple[Prefix, list[Window]]:
         """Return how a step is sampled, and each camera's window: its sampled frames, and the task.
 
-        Raises InvalidSampleError without a frame or for a wrong task; ValueError as ``EpisodeOptions.sampling_for``.
+        Raises InvalidSampleError without a frame or for a wrong task; ValueError as in ``EpisodeOptions.sampling_for``.
         """
         prefix = self.options.sampling_for(info).prefix(max(step, 0))
         try:
@@ -135,10 +135,10 @@ class Steps:
             raise self._located(error) from None
 
     def score(self, step: int, prefix: Prefix, outcomes: Sequence[Result | RewardError], ms: float) -> StepScore:
-        """Return the score of a step from the outcomes of its ``windows``.
+        """Return a step's score from the outcomes for its ``windows``.
 
-        Raises the RewardError of a failed window; ValueError if the checkpoint does not predict what ``options.score``
-        names.
+        Raises a failed window's RewardError; ValueError if the checkpoint does not predict the score in
+        ``options.score``.
         """
         for outcome in outcomes:
             if isinstance(outcome, RewardError):
@@ -166,7 +166,7 @@ class Steps:
 
 
 def _fused(of_cameras: Sequence[FrameScores], fuse: Fuse) -> FrameScores:
-    """Return one trajectory's scores from those of each camera. A mark is True where one camera has it.
+    """Fuse all cameras' scores into one trajectory's. A mark is True where any camera has it.
 
     Where lower is better, ``min`` keeps the largest value and ``max`` the smallest.
     """
@@ -188,7 +188,7 @@ def check_cameras(where: str, frames: Any, cameras: Sequence[str]) -> None:
 
 
 def checked_frame(frame: Any, where: str) -> UInt8Array:
-    """Return a copy of a frame, uint8 [H, W, 3]; the caller may reuse its array. Raises InvalidSampleError."""
+    """Copy a frame, uint8 [H, W, 3], so that the caller may reuse the array. Raises InvalidSampleError."""
     kept = copied(frame)
     is_frame = kept.dtype == np.uint8 and kept.ndim == 3 and kept.shape[2] == 3 and 0 not in kept.shape
     require(where, is_frame, "uint8 [H, W, 3]", f"{kept.dtype} {list(kept.shape)}", InvalidSampleError)
@@ -196,7 +196,7 @@ def checked_frame(frame: Any, where: str) -> UInt8Array:
 
 
 def copied(frame: Any) -> Any:
-    """Return a copy of a frame, or of a dict of frames by camera."""
+    """Copy a frame, or a dict of frames by camera."""
     if isinstance(frame, Mapping):
         return {camera: np.array(as_array(each)) for camera, each in frame.items()}
     return np.array(as_array(frame))

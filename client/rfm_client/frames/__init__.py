@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Frames of trajectories: videos and pictures, their colours and orientation, the rules that sample them.
+"""Trajectory frames: videos and pictures, colours and orientation, sampling rules.
 
 The type aliases are ``Literal`` types: ``typing.get_args(Rule)`` lists the rules.
 """

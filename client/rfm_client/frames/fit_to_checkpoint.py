@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fit a sample to its checkpoint: fewer frames, and frames no larger than it reads them.
+"""Fit a sample to its checkpoint: fewer frames, and frames no larger than the model's input size.
 
 Shrinking needs Pillow: ``rfm-client[resize]``.
 """
@@ -21,7 +21,7 @@ from rfm_client.frames.sampling import FrameIndices, taken, thinned
 
 
 def load_pillow() -> Any:
-    """Return Pillow's ``Image``. Raises ImportError with the extra to install."""
+    """Return Pillow's ``Image``. Raises ImportError, naming the extra to install."""
     try:
         from PIL import Image
     except ImportError as error:
@@ -30,11 +30,11 @@ def load_pillow() -> Any:
 
 
 def resize_frames(frames: UInt8Array, size: FrameSize) -> UInt8Array:
-    """Return frames, uint8 [T, H, W, 3], no larger than the checkpoint reads them; the same array if they fit.
+    """Return frames, uint8 [T, H, W, 3], no larger than the model's input size; the same array if they fit.
 
-    Pillow resizes, bicubic. The network's input stays within a grey level or two for ReWiND. For Qwen's backbones it
-    stays identical if they read the size ``exact``. If they round it to whole patches, frames are resized twice, and
-    single pixels differ by up to 15.
+    Pillow resizes, bicubic. The network's input changes by at most a grey level or two for ReWiND. For Qwen's backbones
+    the input stays identical if they read the size ``exact``. If they round the size to whole patches, frames are
+    resized twice, and single pixels differ by up to 15.
     """
     Image = load_pillow()  # noqa: N806  Pillow's spelling
     height, width = size.fitted(frames.shape[1], frames.shape[2])
@@ -48,7 +48,7 @@ def resize_frames(frames: UInt8Array, size: FrameSize) -> UInt8Array:
 
 @dataclass(frozen=True)
 class FittedSample:
-    """A sample to send, and the frames that it kept.
+    """A sample to send, and which frames it kept.
 
     frame_indices: for each trajectory int64 [N], its frames in the sample; None: all
     """
@@ -66,7 +66,7 @@ def whole(sample: Sample) -> FittedSample:
 
 
 def snapshot(sample: Sample) -> Sample:
-    """Return the sample with copies of its arrays, so that the caller may change the originals before it is sent."""
+    """Copy the sample's arrays, so that the caller may change the originals before the sample is sent."""
 
     def copied(trajectory: Trajectory) -> Trajectory:
         arrays = {name: getattr(trajectory, name) for name in ("video_embeddings", "text_embedding")}
@@ -77,9 +77,9 @@ def snapshot(sample: Sample) -> Sample:
 
 
 def fitted(sample: Sample, max_frames: int | None, frame_size: FrameSize | None) -> FittedSample:
-    """Return the sample with at most ``max_frames`` frames a trajectory, of at most ``frame_size``.
+    """Return the sample with at most ``max_frames`` frames per trajectory, of at most ``frame_size``.
 
-    max_frames: frames are left out as in training (``sampling.thinned``), but not in dense mode, where the server
+    max_frames: thin out frames as in training (``sampling.thinned``), but not in dense mode, where the server
         samples each prefix; None: any number
     frame_size: None: any size
     """
@@ -95,7 +95,7 @@ def fitted(sample: Sample, max_frames: int | None, frame_size: FrameSize | None)
 
 
 def with_frame_indices(result: Result, indices: Sequence[FrameIndices | None]) -> Result:
-    """Return the result with the indices of the scored frames, as of ``FittedSample.frame_indices``."""
+    """Add the scored frames' indices to the result, as in ``FittedSample.frame_indices``."""
     if all(kept is None for kept in indices):
         return result
     if isinstance(result, ProgressResult):

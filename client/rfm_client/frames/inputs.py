@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Trajectories from files, URLs, and the steps of robot datasets.
+"""Load trajectories from files, URLs, and robot dataset steps.
 
-T steps, H x W pixels, D width of an embedding. Any array may be a torch tensor, also on a GPU or with a gradient; torch
+T steps, H x W pixels, D embedding width. Any array may be a torch tensor, also on a GPU or with a gradient; torch
 is not imported.
 """
 
@@ -31,11 +31,11 @@ _BROKEN_NPY = (  # numpy's errors for a broken .npy header
     *(tokenize.TokenError, MemoryError, RecursionError),
 )
 ARRAY_SUFFIXES = (".npy", ".npz")
-_ARRAYS = (b"\x93NUMPY", b"PK")  # first bytes of .npy and .npz files
+_ARRAYS = (b"\x93NUMPY", b"PK")  # how .npy and .npz files begin
 
-_CAMERA_PREFIX = "observation.images."  # of LeRobot's keys, before the camera's name
-_ONLY_CAMERA = "observation.image"  # LeRobot's key of a single camera without a name
-_IS_PAD = "_is_pad"  # suffix of bool [T]: True for steps before the episode's start or after its end
+_CAMERA_PREFIX = "observation.images."  # precedes the camera's name in LeRobot's keys
+_ONLY_CAMERA = "observation.image"  # LeRobot's key for a single camera without a name
+_IS_PAD = "_is_pad"  # suffix for bool [T]: True for steps before the episode's start or after its end
 _FRAMES = "uint8 or float in 0..1 [T, H, W, 3] or [T, 3, H, W]"
 
 
@@ -54,17 +54,17 @@ def load_trajectory(
     """Return the trajectory in a file or behind an http(s) URL.
 
     ``.npy``: frames, or embeddings [T, D]. ``.npz``: ``frames``, or ``video_embeddings`` and ``text_embedding``; and
-    ``task``, as in ``as_trajectory``. All other files, and every URL, are videos, as in ``read_video``.
+    ``task``, as in ``as_trajectory``. All other files, and all URLs, are videos, as in ``read_video``.
 
-    task: replaces the task of the file
-    fps: frames a second to take from a video; None: all frames
+    task: replaces the file's task
+    fps: frames per second to sample from a video; None: all frames
     start_s, end_s: part of a video, in seconds since its first frame; None: from the start, to the end
     orient: turn that makes frames and views upright
-    channels: order in which their colours are stored
-    views: files or URLs with the frames of further cameras, of which the same part is taken
-    goal: file with a picture, shown as it is stored, upright by its EXIF data. Needs Pillow
+    channels: colour order in stored frames and views
+    views: files or URLs with further cameras' frames, cut to the same part
+    goal: picture file, used as stored, upright by its EXIF data. Needs Pillow
 
-    Raises InvalidSampleError, also for arrays of Python objects, because reading them runs code, and for a video of
+    Raises InvalidSampleError, also for arrays of Python objects, because reading them runs code, and for a video with
     several LeRobot v3.0 episodes, unless ``start_s`` and ``end_s`` select a part.
     """
     part: dict[str, Any] = {"fps": fps, "start_s": start_s, "end_s": end_s}
@@ -82,22 +82,21 @@ def load_trajectory(
 def as_trajectory(
     episode: Mapping[str, Any] | Iterable[Mapping[str, Any]], *, task: str = "", camera: str | None = None
 ) -> Trajectory:
-    """Return the trajectory of an episode of a Hugging Face or LeRobot dataset.
+    """Return the trajectory for an episode in a Hugging Face or LeRobot dataset.
 
     episode: a dict over all steps, or a dict for each step, with the keys
 
     ``observation.images.<camera>`` or ``frames``: [T, H, W, 3] or [T, 3, H, W], or a sequence of T images (arrays,
-        tensors, PIL, which is turned as its EXIF data say); uint8, or float in 0..1, which is multiplied by 255 and
-        rounded
+        tensors, PIL, turned according to EXIF data); uint8, or float in 0..1, which is multiplied by 255 and rounded
     ``video_embeddings``, ``text_embedding``: as in Trajectory
     ``task``: text, the same at all steps
-    ``<key>_is_pad``: bool [T], True for a step that LeRobot marks as padding, which is left out; the key is that of the
+    ``<key>_is_pad``: bool [T], True for a step that LeRobot marks as padding, which is dropped; the key is that of the
         frames or ``video_embeddings``
 
     Other keys are ignored, but ``episode_index``, if present, must be the same at all steps.
 
-    task: replaces the episode's own
-    camera: the camera to take of several; ``image`` for the nameless ``observation.image``
+    task: replaces the episode's task
+    camera: which camera to use, if there are several; ``image`` for the nameless ``observation.image``
 
     Raises InvalidSampleError.
     """
@@ -116,7 +115,7 @@ def as_trajectory(
 
 
 def _loaded(source: str | Path, *, task: str, correction: Correction, part: Mapping[str, Any]) -> Trajectory:
-    """Return the trajectory in one file. Raises InvalidSampleError. part: of a video, as ``read_video`` takes it"""
+    """Return the trajectory in one file. Raises InvalidSampleError. part: video part, as in ``read_video``."""
     if is_url(source) or Path(source).suffix.lower() not in ARRAY_SUFFIXES:
         return Trajectory(frames=correction.applied(read_video(source, **part)), task=task)
     for name, value in part.items():
@@ -137,7 +136,7 @@ def _picture(file: str | Path) -> UInt8Array:
 
 
 def _unpadded(columns: Mapping[str, Any], key: str, values: Any) -> Any:
-    """Return the values [T, ...] of the steps that are no padding. Without marks, return them unchanged."""
+    """Return the values [T, ...] at the steps that are not padding. Without marks, return them unchanged."""
     if key + _IS_PAD not in columns or values is None:
         return values
     steps, padding = as_array(values), as_array(columns[key + _IS_PAD])
@@ -176,7 +175,7 @@ def _arrays(file: Path) -> Mapping[str, npt.NDArray[Any]]:
 
 
 def _columns(steps: Iterable[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """Each key's values at all steps; None where a step lacks the key."""
+    """Return each key's values at all steps; None where a step lacks the key."""
     items = list(steps) if isinstance(steps, Iterable) else [steps]
     strangers = [type(item).__name__ for item in items if not isinstance(item, Mapping)]
     got = [*strangers, "nothing"][0]
@@ -186,7 +185,7 @@ def _columns(steps: Iterable[Mapping[str, Any]]) -> Mapping[str, Any]:
 
 
 def _only(columns: Mapping[str, Any], key: str, default: Any) -> Any:
-    """The key's value, equal at all steps."""
+    """Return the key's value, equal at all steps."""
     values = _values(columns[key]) if key in columns else [default]
     for value in values:
         got = f"{values[0]!r} and {value!r}"
@@ -195,7 +194,7 @@ def _only(columns: Mapping[str, Any], key: str, default: Any) -> Any:
 
 
 def _values(column: Any) -> list[Any]:
-    """Flatten a column: one value for all steps or one a step, in any container."""
+    """Flatten a column: one value for all steps or one per step, in any container."""
     if isinstance(column, str):
         return [column]
     if isinstance(column, Sequence):
@@ -237,7 +236,7 @@ def _frames(where: str, values: Any) -> UInt8Array:
 
 
 def _image(image: Any) -> npt.NDArray[Any]:
-    return as_array(upright_picture(image) if hasattr(image, "getexif") else image)  # a picture of Pillow's
+    return as_array(upright_picture(image) if hasattr(image, "getexif") else image)  # a Pillow picture
 
 
 def _uint8(where: str, image: npt.NDArray[Any]) -> UInt8Array:

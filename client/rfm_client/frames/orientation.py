@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Convert stored frames to upright RGB, per camera: turn them, and swap red and blue.
 
-Also the functions that fuse the scores of several cameras. H x W pixels.
+Also the functions that fuse scores from several cameras. H x W pixels.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ def turned(frames: UInt8Array, orientation: Orientation) -> UInt8Array:
 
 
 def _check(name: str, values: tuple[str, ...], value: object) -> None:
-    """Raise ValueError unless the value is one of the option's values."""
+    """Raise ValueError unless the value is valid for this option."""
     require(name, value in values, f"one of {', '.join(values)}", repr(value), ConfigError)
 
 
 @dataclass(frozen=True)
 class Correction:
-    """How a camera's stored frames become upright RGB. Raises ValueError for an unknown value.
+    """How to turn a camera's stored frames into upright RGB. Raises ValueError for an unknown value.
 
     orient: rotation or flip that makes them upright
     channels: stored channel order
@@ -68,7 +68,7 @@ class Correction:
         orient: Orientation | Mapping[str, Orientation] = "none",
         channels: ChannelOrder | Mapping[str, ChannelOrder] = "rgb",
     ) -> Correction:
-        """Return a camera's correction. orient, channels: one value for all cameras, or a dict of values by camera"""
+        """Return a camera's correction. orient, channels: one value for all cameras, or a dict by camera."""
         return cls(
             orient if isinstance(orient, str) else orient.get(camera, "none"),
             channels if isinstance(channels, str) else channels.get(camera, "rgb"),

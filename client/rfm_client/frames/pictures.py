@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Decode pictures of 8-bit colours, upright by EXIF orientation, like ``datasets`` and LeRobot. Needs Pillow.
+"""Decode 8-bit pictures, upright by EXIF orientation, like ``datasets`` and LeRobot. Needs Pillow.
 
 H x W pixels.
 """
@@ -25,26 +25,26 @@ _UPRIGHT = {  # Pillow's name by EXIF orientation
     7: "TRANSVERSE",
     8: "ROTATE_90",
 }
-_HEAD_BYTES = 2**13  # in which EXIF and XMP data begin
+_HEAD_BYTES = 2**13  # EXIF and XMP data begin within these bytes
 _MARKS = (b"Exif", b"eXIf", b"type exif", b"adobe", b"WEBP")  # JPEG, PNG, older PNG, XMP; WebP has EXIF at its end
-_COLOURS = ("1", "L", "LA", "P", "RGB", "RGBA")  # Pillow's modes of at most 8 bits a channel
+_COLOURS = ("1", "L", "LA", "P", "RGB", "RGBA")  # Pillow's modes with at most 8 bits per channel
 _BROKEN = (OSError, SyntaxError, ValueError)  # Pillow's errors for broken pixels, headers and EXIF data
-_DEEP = ";16"  # Pillow's mark of 16 bits a channel, which it cuts to 8
+_DEEP = ";16"  # Pillow's mark for 16 bits per channel, which it cuts to 8
 
 
 class FrameFileError(InvalidValueError):
-    """A file that is not one readable video or picture. where: place in it, such as ``frame 3``; empty: the file"""
+    """A file that is not one readable video or picture. where: place in it, such as ``frame 3``; empty: the file."""
 
     @classmethod
     def of(cls, expected: str, got: object) -> FrameFileError:
-        """Return the error of the whole file."""
+        """Return the error for the whole file."""
         return cls.at("", expected, got)
 
 
 class Picture:
     """A picture of 8-bit colours. Needs Pillow.
 
-    stored: content of its file, path of its file, or a picture that Pillow has opened
+    stored: file content, file path, or a picture that Pillow has opened
     """
 
     def __init__(self, stored: Any) -> None:
@@ -52,7 +52,7 @@ class Picture:
 
     @staticmethod
     def decoder() -> str:
-        """Return Pillow's name and version. Raises ImportError with the extra to install."""
+        """Return Pillow's name and version. Raises ImportError, naming the extra to install."""
         try:
             import PIL
         except ImportError as error:
@@ -80,13 +80,13 @@ class Picture:
         try:
             with Image.open(_file_of(self._stored)) as opened:
                 orientation = _orientation(opened)
-        except (*_BROKEN, Image.DecompressionBombError):  # ``check`` says what is wrong
+        except (*_BROKEN, Image.DecompressionBombError):  # ``check`` reports what is wrong
             return None
         return orientation if orientation in _UPRIGHT else None
 
 
 def opened_picture(picture: bytes | Path) -> Any:
-    """Open a picture of 8-bit colours, or its file, and read only its header. Raises FrameFileError."""
+    """Open a picture of 8-bit colours, or its file, and read only the header. Raises FrameFileError."""
     Picture.decoder()
     from PIL import Image, UnidentifiedImageError
 
@@ -105,7 +105,7 @@ def opened_picture(picture: bytes | Path) -> Any:
 
 
 def decoded_picture(picture: Any) -> UInt8Array:
-    """Return the pixels of an opened picture, uint8 [H, W, 3], upright by EXIF, and close it. Raises FrameFileError."""
+    """Return an opened picture's pixels, uint8 [H, W, 3], upright by EXIF, and close it. Raises FrameFileError."""
     with picture:
         try:
             return np.asarray(upright_picture(picture).convert("RGB"))

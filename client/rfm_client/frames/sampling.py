@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Sampling rules: which frames of an episode the model sees when frame t is the newest.
+"""Sampling rules: which frames the model sees when frame t is the newest.
 
-``docs/guides/choose_frames.md`` lists the rules and their users. No rule shows a frame after t.
+``docs/guides/choose_frames.md`` lists the rules and who uses them. No rule shows a frame after t.
 
-Shapes: K the rule's number of frames, S slots of the sample, T frames of the episode.
+Shapes: K frames in the rule, S slots in the sample, T frames in the episode.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _PADDED: tuple[Rule, ...] = ("rint_pad", *_REWIND)  # filled up to K slots with 
 
 @dataclass(frozen=True, eq=False)
 class Prefix:
-    """The frames that a rule shows of the frames 0 to t, and the slot whose score counts for frame t.
+    """Which frames from 0 to t a rule shows, and which slot's score counts for frame t.
 
     indices: int64 [S], the frame in each slot, padding included
     read: the slot whose score counts for frame t
@@ -44,9 +44,9 @@ class Prefix:
 
     @property
     def frame_slots(self) -> FrameIndices:
-        """int64 [N], a slot for each of the N distinct frames, in order.
+        """int64 [N], one slot for each of the N distinct frames, in order.
 
-        For a repeated frame, its last slot; for frame t, the slot ``read``.
+        A repeated frame takes its last slot; frame t takes the slot ``read``.
         """
         slots = np.flatnonzero(np.diff(self.indices, append=self.indices[-1] + 1))
         slots[-1] = self.read
@@ -55,7 +55,7 @@ class Prefix:
 
 @dataclass(frozen=True)
 class Sampling:
-    """A sampling rule and its number of frames. Raises ValueError if the rule does not take the number.
+    """A sampling rule and its frame count. Raises ValueError if the rule does not accept the count.
 
     frames: K; None for the rule ``all``. For ``rewind_pad16_*``, None becomes 16
     """
@@ -79,13 +79,13 @@ class Sampling:
     def of(
         cls, rule: Rule | None, frames: int | None, trained_frames: int | None, *, trained_padding: bool = True
     ) -> Sampling:
-        """Return the caller's rule and number of frames.
+        """Return the caller's rule and frame count.
 
-        None: those of training, but ``rewind_pad16_*`` takes 16 and ``all`` no number
+        None: as in training, but ``rewind_pad16_*`` takes 16 and ``all`` no count
 
-        trained_frames, trained_padding: ``max_frames`` and ``trained_padding`` of the checkpoint's ``ModelInfo``
+        trained_frames, trained_padding: ``max_frames`` and ``trained_padding`` in the checkpoint's ``ModelInfo``
 
-        Raises ValueError if a required number is given by neither caller nor checkpoint.
+        Raises ValueError if neither caller nor checkpoint gives a required count.
         """
         rule = rule or ("rint_pad" if trained_padding else "rint")
         if frames is None and rule not in (*_REWIND, "all"):
@@ -114,16 +114,16 @@ class Sampling:
         return Prefix(shown, own_slot if self.rule == "rewind_pad16_offline" else len(shown) - 1)
 
     def samples(self, trajectory: Trajectory) -> Iterator[ProgressSample]:
-        """Yield the sample of each prefix, for t from 0 to T - 1. Raises InvalidSampleError."""
+        """Yield a sample for every prefix, for t from 0 to T - 1. Raises InvalidSampleError."""
         for t in range(trajectory.num_frames):
             yield ProgressSample(taken(trajectory, self.prefix(t).indices))
 
     def joined(self, results: Sequence[ProgressResult]) -> ProgressResult:
-        """Return the episode's result: frame t's scores are those of prefix 0 to t at the slot ``Prefix.read``.
+        """Return the episode's result: frame t takes its scores from prefix 0..t at the slot ``Prefix.read``.
 
-        results: [T], for the samples of ``samples``
+        results: [T], for the samples from ``samples``
 
-        Raises InferenceFailedError for results of several versions of the checkpoint.
+        Raises InferenceFailedError for results from several checkpoint versions.
         """
         reads = (self.prefix(t).read for t in range(len(results)))
         return ProgressResult.of_parts(
@@ -132,7 +132,7 @@ class Sampling:
 
 
 def thinned(num_frames: int, limit: int | None) -> FrameIndices | None:
-    """Return the frames, int64 [limit], that training would keep of a longer clip; None: all are kept.
+    """Return which frames, int64 [limit], training would keep from a longer clip; None: all are kept.
 
     Uses the rule ``rint``, by which upstream cuts training clips.
     """

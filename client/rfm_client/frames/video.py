@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read the frames of video files and URLs. Needs PyAV: ``pip install "./client[video]"``."""
+"""Read frames from video files and URLs. Needs PyAV: ``pip install "./client[video]"``."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ _LOST = (
     "load_trajectory"
 )
 _REMUX = "extract the stream and encode it: ffmpeg -i IN -c copy RAW.h264; ffmpeg -framerate FPS -i RAW.h264 OUT.mp4"
-_RGB_BYTES = 3  # of a pixel
+_RGB_BYTES = 3  # bytes per pixel
 _PICTURES = (b"\xff\xd8\xff", b"\x89PNG", b"RIFF", b"II*\0", b"MM\0*")  # first bytes: JPEG, PNG, WebP, TIFF
-_ANIMATED_WEBP = "webp_anim"  # FFmpeg's format, which PyAV 19 has; before, it is one packet of webp_pipe
-_WITH_PREVIEWS = "MPO"  # Pillow's name of a JPEG file with further, smaller pictures
+_ANIMATED_WEBP = "webp_anim"  # FFmpeg's format, known to PyAV 19; before, it is one webp_pipe packet
+_WITH_PREVIEWS = "MPO"  # Pillow's name for a JPEG file with further, smaller pictures
 
 
 def frame_indices(total: int, native_fps: float, fps: float) -> npt.NDArray[np.int64]:
-    """Return int64 [T], frame indices to show a video of ``total`` frames at ``fps``.
+    """Return int64 [T], which frames to show from a video with ``total`` frames at ``fps``.
 
     As in upstream's example client: T = round(total * fps / native_fps), at least 1 and at most ``total``, evenly
     spaced from first to last, rounded down.
@@ -76,23 +76,23 @@ def read_video(
     take: Take | None = None,
     container: str | None = None,
 ) -> UInt8Array:
-    """Return uint8 [T, H, W, 3], the frames at ``fps`` of a video file or http(s) URL; None: all frames.
+    """Return uint8 [T, H, W, 3], the frames at ``fps`` from a video file or http(s) URL; None: all frames.
 
     Frames are counted, not timed: at a variable frame rate, T follows the average rate, and frames are evenly spaced in
     number, not in time. Colours equal ``ffmpeg -pix_fmt rgb24`` with any PyAV. Frames are turned and mirrored as the
-    file says. A picture counts as a video of one frame. Only the returned frames stay in memory. A URL is downloaded
+    file says. A picture counts as a one-frame video. Only the returned frames stay in memory. A URL is downloaded
     once, to a temporary file.
 
     start_s, end_s: part from ``start_s`` to before ``end_s``, in seconds since the first frame;
         None: from the start, to the end
-    timeout_s: longest silence from a URL's server
-    take: called before each frame takes memory, with the number of bytes; its error ends the reading
+    timeout_s: how long a URL's server may stay silent
+    take: called with the byte count before each frame takes memory; an error in it ends the reading
     container: FFmpeg's name for the file format; None: FFmpeg guesses. Name it for untrusted files, because some
         formats make FFmpeg open other files or addresses
 
-    Raises InvalidSampleError for a missing file, a file of no video, several videos or depth maps, fewer frames than
-    packets, and a frame that the decoder marks as damaged among those returned. Also for a file of several LeRobot
-    episodes (v3.0) without both ``start_s`` and ``end_s``.
+    Raises InvalidSampleError for a missing file, for no video, several videos or depth maps, if there are fewer frames
+    than packets, and if the decoder marks a returned frame as damaged. Also for a file with several LeRobot episodes
+    (v3.0) without both ``start_s`` and ``end_s``.
     """
     import_av()
     _check_numbers(fps, start_s, end_s, timeout_s)
@@ -135,7 +135,7 @@ def frame_times_s(file: str | Path, num_frames: int, *, container: str | None = 
 
 @contextmanager
 def _errors_of(source: str | Path) -> Iterator[None]:
-    """Raise errors of the block as InvalidSampleError with the source."""
+    """Turn errors in the block into InvalidSampleError with the source."""
     try:
         yield
     except FrameFileError as error:
@@ -150,10 +150,10 @@ def _errors_of(source: str | Path) -> Iterator[None]:
 
 
 def _read_instead(error: Exception) -> object:
-    """What was there in place of a video, without the words of FFmpeg and urllib."""
+    """Say what was there instead of a video, without quoting FFmpeg or urllib."""
     if isinstance(error, import_av().InvalidDataError):
         return "a file of another kind, or a damaged one"
-    reason = getattr(error, "reason", None)  # of a URL
+    reason = getattr(error, "reason", None)  # from a URL
     fault = reason if isinstance(reason, OSError) else error
     return getattr(fault, "strerror", None) or fault
 
@@ -187,12 +187,12 @@ def _opened(source: str | Path, timeout_s: float) -> Iterator[BinaryIO]:
 
 
 def _still(file: BinaryIO) -> UInt8Array | None:
-    """uint8 [H, W, 3], a single picture, upright by EXIF, which PyAV reads or not by version; None: a video."""
+    """Return uint8 [H, W, 3], a single picture, upright by EXIF, which only some PyAV versions read; None: a video."""
     beginning = file.read(max(map(len, _PICTURES)))
     file.seek(0)
     if not beginning.startswith(_PICTURES):
         return None
-    with import_av().open(file) as opened:  # a stream of pictures has another format, or several packets
+    with import_av().open(file) as opened:  # a picture stream has another format, or several packets
         is_still = opened.format.name.endswith("_pipe") and sum(packet.size > 0 for packet in opened.demux()) == 1
         is_still |= opened.format.name == _ANIMATED_WEBP
     file.seek(0)
@@ -219,7 +219,7 @@ def _download(url: str, file: BinaryIO, timeout_s: float) -> None:
 
 
 def _within(packets: Packets, start_s: float | None, end_s: float | None) -> tuple[int, int]:
-    """Numbers of the first frames from ``start_s`` and from ``end_s`` on, within half a frame."""
+    """Return the first frame numbers at or after ``start_s`` and ``end_s``, within half a frame."""
     half_s, times_s = 0.5 / packets.fps, packets.since_first_s
     bounds_s = [(start_s or 0.0) - half_s, (math.inf if end_s is None else end_s) - half_s]
     first, end = np.searchsorted(times_s, bounds_s).tolist()
@@ -237,11 +237,11 @@ def _picked(first: int, end: int, packets: Packets, fps: float | None) -> npt.ND
 def _whole(
     file: BinaryIO, packets: Packets, fps: float | None, take: Take, container: str | None
 ) -> Sequence[UInt8Array]:
-    """The frames at ``fps``, told by their numbers, because some videos have no time stamps."""
+    """Return the frames at ``fps``, found by number, because some videos have no time stamps."""
     wanted = set(_picked(0, packets.count, packets, fps).tolist())
     frames, times_s = _decoded(file, lambda number, _: number in wanted, take, container)
     total = len(times_s)
-    if packets.num_hidden and not _rises(times_s):  # those hidden are others than the video means
+    if packets.num_hidden and not _rises(times_s):  # the hidden frames are not the ones meant
         expected = f"{packets.count + packets.num_hidden} frames ({_REMUX})"
         raise FrameFileError.of(expected, f"{total}, and time stamps in another order than the frames")
     if total < packets.count:
@@ -255,7 +255,7 @@ def _whole(
 def _part(
     file: BinaryIO, packets: Packets, part: tuple[int, int], fps: float | None, take: Take, container: str | None
 ) -> Sequence[UInt8Array]:
-    """The frames of a part at ``fps``, told by their time stamps, because frames before it may be lost."""
+    """Return a part's frames at ``fps``, found by time stamp, because frames before it may be lost."""
     wanted_s = set(packets.times_s[_picked(*part, packets, fps)].tolist())
     begin_s, last_s = packets.times_s[part[0]], packets.times_s[part[1] - 1]
     frames, times_s = _decoded(file, lambda _, time_s: time_s in wanted_s, take, container)
@@ -277,7 +277,7 @@ def _rises(times_s: Sequence[float | None]) -> bool:
 def _decoded(
     file: BinaryIO, is_wanted: Callable[[int, float | None], bool], take: Take, container: str | None
 ) -> tuple[Sequence[UInt8Array], Sequence[float | None]]:
-    """The frames that are wanted by number and time, and the times of all frames; None: no time stamp."""
+    """Return the frames wanted by number and time, and the times of all frames; None: no time stamp."""
     picked: list[UInt8Array] = []
     times_s: list[float | None] = []
     upright = Upright()
@@ -295,7 +295,7 @@ def _decoded(
 
 
 def _judged(frames: Iterable[Any]) -> Iterator[tuple[Any, bool]]:
-    """The frames that ``judged`` gives, with the number of the one that fails in the error."""
+    """Yield from ``judged``; if a frame fails, the error names its number."""
     num_given = 0
     try:
         for each in judged(frames):

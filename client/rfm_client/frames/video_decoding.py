@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Decoding shared by all readers of videos: stream, colours, orientation, damaged frames, broken files.
+"""Decoding shared by all video readers: stream, colours, orientation, damaged frames, broken files.
 
 Containers, streams, packets and frames are PyAV's.
 """
@@ -28,24 +28,24 @@ DAMAGED = "one that the decoder marks, or is made from such a one"
 DOWNLOAD = "download it again"
 _HEADLESS = ("an HEVC video that begins with a key frame (cut it there: ffmpeg -ss SECONDS -i IN OUT)", "another frame")
 
-_NO_MATRIX, _BT601, _BT2020 = 0, 5, 9  # from YUV to RGB, as ITU-T H.273 numbers them
-_MATRICES = (1, 4, _BT601, 7, _BT2020)  # that libswscale knows; it takes BT.601 in place of others
+_NO_MATRIX, _BT601, _BT2020 = 0, 5, 9  # from YUV to RGB, as numbered by ITU-T H.273
+_MATRICES = (1, 4, _BT601, 7, _BT2020)  # known to libswscale, which replaces others by BT.601
 _SAME_MATRIX = {6: _BT601, 10: _BT2020}  # other numbers for the same matrix
-_BITS = 8  # most bits of a grey video's only channel; depth maps have more
-_TS_SYNC, _TS_PACKETS = 0x47, ((188, 0), (192, 4))  # first byte, lengths and its offset (ISO 13818-1, Blu-ray)
-_PNG, _WEBP, _PICTURE_HEAD_BYTES = b"\x89PNG", b"WEBP", 12  # a WebP file's name of its kind comes last
-_HEAD_BYTES = 1024  # enough to recognise MPEG-TS packets, or the padding of a GIF
+_BITS = 8  # most bits in a grey video's only channel; depth maps have more
+_TS_SYNC, _TS_PACKETS = 0x47, ((188, 0), (192, 4))  # first byte, its offset by packet length (ISO 13818-1, Blu-ray)
+_PNG, _WEBP, _PICTURE_HEAD_BYTES = b"\x89PNG", b"WEBP", 12  # a WebP file's type name comes last
+_HEAD_BYTES = 1024  # enough to recognise MPEG-TS packets, or a GIF's padding
 _SEVERAL_EPISODES = (
     "a file in the layout of LeRobot v3.0, which holds several: label the dataset with rfm-client label, or name a "
     "part: start_s and end_s of load_trajectory, in seconds since the file's first frame (from_timestamp in "
     "meta/episodes, and length / fps later)"
 )
-_SHARED_FILE = re.compile(r"/videos/[^/]+/chunk-\d+/file-\d+\.\w+$")  # of several episodes, in LeRobot v3.0
-_NEARLY = math.tan(math.radians(1))  # FFmpeg's tolerance for quarter turns of a display matrix
+_SHARED_FILE = re.compile(r"/videos/[^/]+/chunk-\d+/file-\d+\.\w+$")  # holds several episodes, in LeRobot v3.0
+_NEARLY = math.tan(math.radians(1))  # FFmpeg's tolerance for quarter turns in a display matrix
 
 
 def import_av() -> Any:
-    """Return the module ``av``. Raises ImportError with the extra to install."""
+    """Return the module ``av``. Raises ImportError, naming the extra to install."""
     try:
         import av
     except ImportError as error:
@@ -54,7 +54,7 @@ def import_av() -> Any:
 
 
 def decoder() -> str:
-    """Return the versions of PyAV and of its libraries that decide the pixels of a decoded frame."""
+    """Return the versions of PyAV and its libraries that determine decoded pixels."""
     av = import_av()
     names = ("libswscale", "libavcodec", "libavfilter")
     libraries = (f"{name} {'.'.join(map(str, av.library_versions[name]))}" for name in names)
@@ -62,7 +62,7 @@ def decoder() -> str:
 
 
 def video_stream(container: Any) -> Any:
-    """Return the only video stream of an opened container. Attached pictures, such as cover art, do not count.
+    """Return an opened container's only video stream. Attached pictures, such as cover art, do not count.
 
     Raises FrameFileError for no stream, several streams, or depth maps.
     """
@@ -82,14 +82,14 @@ def video_stream(container: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Packets:
-    """The packets of a video's frames, read without decoding.
+    """A video's frame packets, read without decoding.
 
-    count: packets of frames that are shown; equals the number of frames unless a packet holds several
+    count: packets whose frames are shown; equals the frame count unless a packet holds several frames
     times_s: float64 [N], sorted time stamps; packets without a time stamp are left out
-    num_bytes: size of each of these N packets
+    num_bytes: sizes of these N packets
     num_hidden: packets that are not shown, as in videos cut without encoding
-    tick_s: unit of the time stamps, in seconds
-    fps: average frames a second; 0: the file does not say it
+    tick_s: time stamp unit, in seconds
+    fps: average frames per second; 0: the file does not give it
     """
 
     count: int
@@ -101,17 +101,17 @@ class Packets:
 
     @property
     def since_first_s(self) -> npt.NDArray[np.float64]:
-        """Return float64 [N], the time stamps from the first frame on."""
+        """Return float64 [N], time stamps relative to the first frame."""
         return self.times_s - self.times_s[:1]
 
 
 def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
-    """Return the packets of a video. They are counted, because the container's own count may be wrong.
+    """Return a video's packets. They are counted, because the container's own count may be wrong.
 
-    container: FFmpeg's name of the file's format; None: FFmpeg guesses it
+    container: FFmpeg's name for the file format; None: FFmpeg guesses it
 
-    Raises FrameFileError, also for broken packets, and the errors of PyAV. A Matroska or Ogg file that ends too early
-    is read as far as it goes.
+    Raises FrameFileError, also for broken packets, and PyAV's errors. A Matroska or Ogg file that ends too early
+    is read as far as possible.
     """
     _check_ends(file)
     _check_upright(file)
@@ -126,7 +126,7 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
                 and not packet.is_keyframe
                 and stream.codec_context.name == "hevc"
             ):
-                raise FrameFileError.of(*_HEADLESS)  # FFmpeg 7 makes pictures up to the first key frame, without a mark
+                raise FrameFileError.of(*_HEADLESS)  # FFmpeg 7 makes pictures up to the first key frame, unmarked
             if not packet.size or packet.is_discard:
                 num_hidden += bool(packet.size)
                 continue
@@ -142,9 +142,9 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
 
 
 def _check_ends(file: BinaryIO) -> None:
-    """Raise FrameFileError for Git LFS's pointer to a video, and a truncated GIF or MPEG-TS file.
+    """Raise FrameFileError for Git LFS's pointer to a video, and for a truncated GIF or MPEG-TS file.
 
-    The decoders of those two may give part of a picture.
+    Decoders for those two may return part of a picture.
     """
     num_bytes = file.seek(0, os.SEEK_END)
     file.seek(max(num_bytes - _HEAD_BYTES, 0))
@@ -165,7 +165,7 @@ def _check_ends(file: BinaryIO) -> None:
 def _check_upright(file: BinaryIO) -> None:
     """Raise FrameFileError for PNG or WebP pictures with an EXIF orientation.
 
-    PyAV before 17.1 ignores it, and PyAV 19 turns only the first picture of an APNG file.
+    PyAV before 17.1 ignores it, and PyAV 19 turns only the first picture in an APNG file.
     """
     head = file.read(_PICTURE_HEAD_BYTES)
     if head.startswith(_PNG) or head.endswith(_WEBP):
@@ -177,7 +177,7 @@ def _check_upright(file: BinaryIO) -> None:
 
 
 def check_is_one_episode(source: str | Path) -> None:
-    """Raise InvalidSampleError for a path or URL in the layout of LeRobot v3.0, whose files hold several episodes."""
+    """Raise InvalidSampleError for a path or URL in LeRobot v3.0's layout, where files hold several episodes."""
     if isinstance(source, Path) or "://" not in source:
         paths = [Path(source).absolute().as_posix(), Path(source).resolve().as_posix()]  # a download may be a link
     else:
@@ -189,7 +189,7 @@ def check_is_one_episode(source: str | Path) -> None:
 class Upright:
     """Convert decoded frames to RGB, turned and mirrored as FFmpeg shows them.
 
-    Keeps FFmpeg's converter from frame to frame, so each video needs one of its own.
+    FFmpeg's converter is kept from frame to frame, so create one object per video.
     """
 
     def __init__(self) -> None:
@@ -200,7 +200,7 @@ class Upright:
         """Return uint8 [H, W, 3]. Raises FrameFileError for a frame that FFmpeg would show aslant."""
         try:
             image, matrix = self._rgb(frame), frame.side_data.get("DISPLAYMATRIX")
-        except ValueError as error:  # PyAV 17.1 to 18.1 fail at the EXIF data of a Motion JPEG video
+        except ValueError as error:  # PyAV 17.1 to 18.1 fail on a Motion JPEG video's EXIF data
             remedy = "encode it anew: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4"
             expected = f"frames without EXIF data, which PyAV cannot read ({remedy})"
             raise FrameFileError.of(expected, error) from error
@@ -222,7 +222,7 @@ class Upright:
 
 
 def judged(frames: Iterable[Any]) -> Iterator[tuple[Any, bool]]:
-    """Yield each decoded frame with True if the decoder marked it, or a frame before it since the last key frame."""
+    """Yield decoded frames with True if the decoder marked the frame, or one before it since the last key frame."""
     is_damaged = False
     for frame in frames:
         is_damaged = frame.is_corrupt or (is_damaged and not frame.key_frame)
@@ -230,7 +230,7 @@ def judged(frames: Iterable[Any]) -> Iterator[tuple[Any, bool]]:
 
 
 def _check_colours(pixels: Any) -> None:
-    """Refuse pixels of depth maps: floats, or a single deep channel besides transparency."""
+    """Refuse depth map pixels: floats, or a single deep channel besides transparency."""
     if pixels is None:
         return
     has_one = len(pixels.components) <= 2 and max(component.bits for component in pixels.components) > _BITS
@@ -240,7 +240,7 @@ def _check_colours(pixels: Any) -> None:
 
 
 def _known_matrix(frame: Any) -> int:
-    """The frame's matrix, or the one that FFmpeg takes in its place where it does not know the frame's."""
+    """Return the frame's matrix, or FFmpeg's replacement if it does not know the matrix."""
     if frame.format.is_rgb:
         return _NO_MATRIX
     matrix = _SAME_MATRIX.get(frame.colorspace, frame.colorspace)

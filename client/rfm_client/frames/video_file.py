@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A video file whose frames are found by their times, each decoded once. Needs PyAV.
+"""A video file whose frames are found by time, each decoded once. Needs PyAV.
 
-Seconds are those of the file, whose first frame need not be at 0. T frames, H x W pixels.
+Seconds follow the file, whose first frame need not be at 0. T frames, H x W pixels.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from rfm_client.frames.video_decoding import (
 
 
 class Video:
-    """A video file.
+    """A video file, read by time.
 
-    container: FFmpeg's name of its format; None: FFmpeg guesses it. Name it for untrusted files, because some formats
-        make FFmpeg open other files or addresses
+    container: FFmpeg's name for the file format; None: FFmpeg guesses it. Name it for untrusted files, because some
+        formats make FFmpeg open other files or addresses
     """
 
     def __init__(self, file: Path, container: str | None = None) -> None:
@@ -44,7 +44,7 @@ class Video:
 
     @staticmethod
     def decoder() -> str:
-        """Return the versions of PyAV and of the libraries that decide the pixels. Raises ImportError."""
+        """Return the versions of PyAV and the libraries that determine the pixels. Raises ImportError."""
         return decoder()
 
     def check_is_one_episode(self) -> None:
@@ -65,9 +65,9 @@ class Video:
 
     @contextmanager
     def opened(self) -> Iterator[tuple[Any, Any]]:
-        """Yield the file as PyAV opens it, and its only video stream. Raises FrameFileError, and the errors of PyAV."""
+        """Yield the file as opened by PyAV, and its only video stream. Raises FrameFileError and PyAV's errors."""
         with import_av().open(str(self.file), format=self.container) as container:
-            # with PyAV's default of threads: thread_type AUTO loses some marks of damage
+            # with PyAV's default threading: thread_type AUTO loses some damage marks
             yield container, video_stream(container)
 
     def frames_at(self, times_s: npt.NDArray[np.float64], tolerance_s: float) -> Iterator[UInt8Array]:
@@ -92,7 +92,7 @@ class Video:
 
 
 def _from(container: Any, stream: Any, first_s: float, tolerance_s: float) -> Iterator[Any]:
-    """Yield the frames in order of time, from one before ``first_s`` on."""
+    """Yield frames in time order, from one before ``first_s`` on."""
     # a frame earlier, because time stamps are rounded
     container.seek(max(int((first_s - 2 * tolerance_s) / stream.time_base), 0), stream=stream)
     frames = container.decode(stream)

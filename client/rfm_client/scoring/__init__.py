@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Steps of a call in both clients: samples to requests, answers to results."""
+"""What both clients do in a call: turn samples into requests and answers into results."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Grouping of samples into requests: they fit the same arrays, within limits of number and bytes."""
+"""Group samples into requests: samples in a group fit the same arrays, within count and byte limits."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from itertools import groupby
 from rfm_client.contract.samples import Sample, stackable
 from rfm_client.contract.wire import frames_name
 
-MAX_REQUEST_BYTES = 8 * 2**20  # more gains nothing, since Triton batches requests
+MAX_REQUEST_BYTES = 8 * 2**20  # more gains nothing, because Triton batches requests
 
 
 def model_of(sample: Sample, model: str) -> str:
-    """Return the name of the model that scores the sample, for embeddings or for raw frames."""
+    """Return the name of the model that scores the sample: the one for embeddings or for raw frames."""
     return model if sample.trajectories[0].frames is None else frames_name(model)
 
 
@@ -35,7 +35,7 @@ def groups(samples: Mapping[int, Sample], model: str) -> Iterator[tuple[str, lis
 
 
 def parts(samples: Mapping[int, Sample], group: Sequence[int], max_batch_size: int) -> Iterator[list[int]]:
-    """Cut a group into requests of at most ``max_batch_size`` samples and, unless one has more, MAX_REQUEST_BYTES."""
+    """Split a group into requests: at most ``max_batch_size`` samples and, unless one has more, MAX_REQUEST_BYTES."""
     part: list[int] = []
     longest: list[int] = []
     for index in group:
@@ -49,18 +49,18 @@ def parts(samples: Mapping[int, Sample], group: Sequence[int], max_batch_size: i
 
 
 def padded_bytes(samples: Sequence[Sample]) -> int:
-    """Return the bytes of one request's frames, or embeddings, padding included. The samples fit the same arrays."""
+    """Return how many bytes one request's frames or embeddings take with padding. The samples fit the same arrays."""
     longest: list[int] = [max(sizes) for sizes in zip(*map(array_bytes, samples), strict=True)]
     return len(samples) * sum(longest)
 
 
 def num_positions(sample: Sample) -> int:
-    """Return the number of frames in all trajectories of the sample."""
+    """Return the frame count over all trajectories in the sample."""
     return sum(trajectory.num_frames for trajectory in sample.trajectories)
 
 
 def array_bytes(sample: Sample) -> list[int]:
-    """Return the bytes of the sample's frames, or embeddings, in each array of the request."""
+    """Return how many bytes the sample's frames or embeddings take in each array of the request."""
     first = sample.trajectories[0]
     if len(sample.trajectories) == 1:
         goal = () if first.goal is None else (first.goal,)

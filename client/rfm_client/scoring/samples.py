@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Scoring samples: options and deadline of a call, its requests, and an outcome for each sample."""
+"""Score samples: call options and deadline, requests, and an outcome for every sample."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ from rfm_client.transport.limits import ConcurrencyLimiter, Deadline
 from rfm_client.transport.servers import PROBE_TIMEOUT_S, Servers
 from rfm_client.transport.threads import off_loop
 
-_ID_BYTES = 8  # random bytes in the ids of a call's requests
+_ID_BYTES = 8  # random bytes in a call's request ids
 
 
 class CallOptions(TypedDict, total=False):
-    """Options of every call.
+    """Options for every call.
 
     timeout_s: time limit; None: the client's
     logits: True: add the raw scores for the progress bins (checkpoints with bins only)
     log_prob: True: add a log-probability for each frame (TOPReward only)
-    all_scores: True: add every other score for frames, except ``logits``
+    all_scores: True: add every other frame score, except ``logits``
     timing: True: add the server's time for the batch
     subsample: True: score at most ``ModelInfo.max_frames`` frames, evenly spaced from first to last, as in training;
         ``frame_indices`` in the result lists them
@@ -63,10 +63,10 @@ class CallOptions(TypedDict, total=False):
 class Call:
     """Values shared by all requests in one call. Raises ValueError for an invalid request id.
 
-    outputs: outputs requested by name
-    request_ids: an id for each request
+    outputs: names of outputs to request
+    request_ids: yields an id for each request
     server: index of the server to ask first; None: the least busy
-    checks_blank: True: tell of videos that show nothing
+    checks_blank: True: warn about videos that show nothing
     """
 
     server: int | None = None
@@ -119,9 +119,9 @@ class SampleScorer:
         self._model = model
         self._servers = servers
         self._concurrency = concurrency
-        self._infos: dict[str, ModelInfo] = {}  # until another version of the model answers
-        self._checks_lengths = True  # until one was too long
-        self._checks_blank = True  # until one was blank
+        self._infos: dict[str, ModelInfo] = {}  # until another model version answers
+        self._checks_lengths = True  # until a trajectory was too long
+        self._checks_blank = True  # until a video was blank
         self._asking = asyncio.Lock()
 
     async def result(self, sample: Sample, call: Call) -> Result:
@@ -132,7 +132,7 @@ class SampleScorer:
         return with_frame_indices(result, fit.frame_indices)
 
     async def outcomes(self, samples: Sequence[Sample], call: Call) -> list[Outcome]:
-        """Return the result or error of each sample. Errors come without a traceback, which would hold the arrays."""
+        """Return a result or error for each sample. Errors carry no traceback, which would keep arrays alive."""
         fits: dict[int, FittedSample] = {}
         outcomes: dict[int, Outcome] = {}
         for index, sample in enumerate(samples):
@@ -169,7 +169,7 @@ class SampleScorer:
         return self._infos[model]
 
     def tell_of_length(self, num_frames: int, info: ModelInfo) -> None:
-        """Log a line about the first trajectory with more frames than those of training. Its scores are unreliable."""
+        """Log the first trajectory that has more frames than in training. Its scores are unreliable."""
         limit = info.max_frames
         if not self._checks_lengths or limit is None or num_frames <= limit or info.needs_whole_episode:
             return
@@ -179,15 +179,15 @@ class SampleScorer:
         logger.warning(expected, limit, info.source or info.name, num_frames, remedy)
 
     def tell_of_blank(self, frames: Sequence[UInt8Array] | UInt8Array) -> None:
-        """Log a line about the first video that shows nothing. Its scores mean nothing."""
-        few = frames[:: max(len(frames) // _PROBED_FRAMES, 1)]  # of a video that is black at first, not all are read
+        """Log the first video that shows nothing. Its scores mean nothing."""
+        few = frames[:: max(len(frames) // _PROBED_FRAMES, 1)]  # if only the start is black, not all frames are read
         if self._checks_blank and len(frames) > 1 and all(map(is_blank, few)) and all(map(is_blank, frames)):
             self._checks_blank = False
             expected = "frames: expected pictures that show something, got %d frames: %s (logged once)"
             logger.warning(expected, len(frames), BlankFrames(frames).told)
 
     async def _check_lengths(self, samples: Sequence[Sample], deadline: Deadline) -> None:
-        """Tell of samples that are too long. An unknown limit costs one question to the server."""
+        """Warn about samples that are too long. An unknown limit costs one query to the server."""
         lengths: dict[str, int] = {}
         for sample in samples if self._checks_lengths else ():
             model = model_of(sample, self._model)
@@ -198,16 +198,16 @@ class SampleScorer:
                 self.tell_of_length(num_frames, info)
 
     async def _limits(self, model: str, deadline: Deadline) -> ModelInfo | None:
-        """The description of a model whose answer is here already, so that no failure may end the call."""
+        """Return the model's description; None on failure: with the answer already here, the call must not fail."""
         async with self._asking:
             try:
                 return await self.model_info(model, Deadline(min(PROBE_TIMEOUT_S, deadline.remaining_s())))
             except RewardError:
-                self._checks_lengths = False  # else each call would ask
+                self._checks_lengths = False  # otherwise every call would ask again
                 return None
 
     async def _fitted(self, sample: Sample, call: Call) -> FittedSample:
-        """The sample as the call sends it. Raises RewardError."""
+        """Return the sample as the call sends it. Raises RewardError."""
         fit = whole(sample)
         for trajectory in fit.sample.trajectories if self._checks_blank and call.checks_blank else ():
             if trajectory.frames is not None:
@@ -217,13 +217,13 @@ class SampleScorer:
         call.deadline.remaining_s()
         info = await self.model_info(model_of(sample, self._model), call.deadline)
         max_frames, frame_size = info.max_frames if call.subsample else None, info.frame_size if call.resize else None
-        # in a thread, since resizing would block the event loop
+        # in a thread, because resizing would block the event loop
         return await asyncio.to_thread(fitted, sample, max_frames, frame_size)
 
     async def _scored(
         self, model: str, group: Sequence[int], samples: Mapping[int, Sample], call: Call
     ) -> Iterable[tuple[int, Outcome]]:
-        """Indices and outcomes for samples in the same arrays."""
+        """Return indices and outcomes for samples that share arrays."""
         if len(group) == 1:
             return zip(group, await self._request(model, [samples[group[0]]], call), strict=True)
         try:
@@ -237,9 +237,9 @@ class SampleScorer:
     async def _request(
         self, model: str, samples: Sequence[Sample], call: Call, *, asks_given: bool = True
     ) -> Sequence[Outcome]:
-        """Send one request. An invalid sample fails the whole request; then send each sample alone.
+        """Send one request. If an invalid sample makes it fail, send every sample alone.
 
-        asks_given: True: ask for the scores that only some models give, as the model's description says
+        asks_given: True: request the scores that only some models give, according to the model's description
         """
         request_id = next(call.request_ids)
         size, tensors = padded_bytes(samples), partial(wire.encode_samples, samples)
@@ -252,7 +252,7 @@ class SampleScorer:
             return wire.decode_results(answer.tensors, samples, answer.model_version)
         except (InvalidSampleError, InferenceFailedError) as error:
             error.request_id = request_id
-            if isinstance(error, InvalidSampleError) and error.where in more:  # the server has an older export now
+            if isinstance(error, InvalidSampleError) and error.where in more:  # the server now has an older export
                 self._infos.pop(model, None)
                 return await self._request(model, samples, call, asks_given=False)
             if len(samples) == 1:
@@ -263,9 +263,9 @@ class SampleScorer:
         return [outcome for (outcome,) in alone]
 
     async def _given(self, model: str, samples: Sequence[Sample], call: Call) -> tuple[str, ...]:
-        """Names of all scores in the model's description. Raises RewardError."""
+        """Return the names of all scores in the model's description. Raises RewardError."""
         if samples[0].trajectories[0].frames is None and not call.all_scores:
-            return ()  # the description would cost a request, and models of embeddings give no more unasked
+            return ()  # the description would cost a request, and embedding models give no more unasked
         try:
             return (await self.model_info(model, call.deadline)).scores
         except (ModelNotFoundError, InferenceFailedError):  # the request itself decides
@@ -282,9 +282,9 @@ class SampleScorer:
     ) -> Answer:
         """Return the model's ``outputs``. Raises RewardError.
 
-        tensors: makes the inputs of ``num_bytes`` when it is the request's turn
+        tensors: makes the inputs, ``num_bytes`` large, when it is the request's turn
         """
-        # Tensors are made in turn, so that they do not pile up.
+        # Make tensors only in turn, so that they do not pile up.
         async with self._concurrency.room(num_bytes, call.deadline):
             inputs = await off_loop(num_bytes, tensors)
             answer = await self._servers.infer(
@@ -297,21 +297,21 @@ class SampleScorer:
 
 
 def _longest(sample: Sample) -> int:
-    """Frames of the longest trajectory that the model sees as a whole; 0: in dense mode it sees none so."""
+    """Return the longest trajectory's frame count; 0 in dense mode, where the model sees only sampled prefixes."""
     if isinstance(sample, ProgressSample) and sample.frame_steps:
         return 0
     return max(trajectory.num_frames for trajectory in sample.trajectories)
 
 
 async def _together(calls: Sequence[Coroutine[Any, Any, Answered]]) -> Sequence[Answered]:
-    """Await all coroutines. A single coroutine, as in most calls, needs no task of its own."""
+    """Await all coroutines. A single coroutine, as in most calls, needs no separate task."""
     return [await calls[0]] if len(calls) == 1 else await asyncio.gather(*calls)
 
 
 def results_of(outcomes: list[Outcome], where: str = "") -> list[Result]:
-    """Return the outcomes, if all are results. Raises the first error, and takes it out of the list.
+    """Return the outcomes if all are results. Otherwise remove the first error from the list and raise it.
 
-    where: name of a sample, such as ``samples[{}]``, for the error of an invalid one; empty: there is only one
+    where: name for a sample, such as ``samples[{}]``, used in the error for an invalid one; empty: there is only one
     """
     for index, outcome in enumerate(outcomes):
         if isinstance(outcome, RewardError):
@@ -320,12 +320,12 @@ def results_of(outcomes: list[Outcome], where: str = "") -> list[Result]:
                     raise outcome.inside(where.format(index)) from outcome
                 raise outcome
             finally:
-                del outcomes[index], outcome  # an error that its own traceback holds would stay in memory
+                del outcomes[index], outcome  # an error held by its own traceback would stay in memory
     return cast("list[Result]", outcomes)
 
 
 def for_each(error: RewardError, count: int) -> list[Outcome]:
-    """Return ``count`` copies of the error, since callers may raise them separately."""
+    """Return ``count`` copies of the error, because callers may raise them separately."""
     copies: list[Outcome] = []
     error = error.with_traceback(None)
     for _ in range(count):

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Requests to one of several servers: calls, deadlines, retries, shared memory."""
+"""Send requests to one of several servers: calls, deadlines, retries, shared memory."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Calls to one Triton server over gRPC or HTTP. Their errors become RewardErrors."""
+"""Calls to one Triton server over gRPC or HTTP. Errors become RewardErrors."""
 
 from __future__ import annotations
 
@@ -28,28 +28,28 @@ from rfm_client.transport.threads import off_loop
 Answered = TypeVar("Answered")
 
 _US_PER_S = 1_000_000
-_SERVED_TIMEOUT_S = 2.0  # for the names of served models in an error
+_SERVED_TIMEOUT_S = 2.0  # for listing served models in an error
 
 logger = logging.getLogger("rfm_client")
 
 
 @dataclass(frozen=True)
 class Answer:
-    """The outputs of one request, and the version of the model that answered."""
+    """The outputs for one request, and the model version that answered."""
 
     tensors: Tensors
     model_version: str
 
 
 class Transport(Protocol):
-    """A connection to one server, for one event loop. Its methods raise a RewardError."""
+    """A connection to one server, for one event loop. Methods raise RewardError."""
 
     url: str
 
     async def infer(
         self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
     ) -> Answer:
-        """Return the named ``outputs`` of ``model`` for ``inputs``. request_id: id in the server's log"""
+        """Return the named ``outputs`` that ``model`` gives for ``inputs``. request_id: id in the server's log."""
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
         """Return the server's description of ``model``. Raises ModelNotFoundError."""
@@ -64,22 +64,22 @@ class Transport(Protocol):
 def connect(url: str, *, shared_memory: bool = False, credentials: Credentials | None = None) -> TritonTransport:
     """Return the transport for ``grpc://host:port`` or ``http://host:port``, with TLS ``grpcs://`` or ``https://``.
 
-    It connects at first use. Raises ValueError.
+    The transport connects at first use. Raises ValueError.
 
-    shared_memory: True: large inputs go through memory that the server, on the same host, maps too
+    shared_memory: True: send large inputs through memory that the server, on the same host, also maps
     """
     kind = GrpcTransport if split_url(url)[0].startswith("grpc") else HttpTransport
     return kind(url, credentials or Credentials(), shared_memory=shared_memory)
 
 
 class TritonTransport:
-    """Base for gRPC and HTTP, whose asyncio clients differ only in a few options.
+    """Base class for gRPC and HTTP, whose asyncio clients differ only in a few options.
 
     tritonclient's module is imported at first use. The client belongs to the event loop that runs then.
     """
 
-    _module: ClassVar[str]  # of tritonclient, with its InferInput and InferRequestedOutput
-    as_json: ClassVar[dict[str, bool]] = {}  # makes its methods return dictionaries
+    _module: ClassVar[str]  # tritonclient's module with InferInput and InferRequestedOutput
+    as_json: ClassVar[dict[str, bool]] = {}  # makes the client's methods return dictionaries
     _proxy: str | None = None  # for errors
 
     def __init__(self, url: str, credentials: Credentials, *, shared_memory: bool) -> None:
@@ -90,7 +90,7 @@ class TritonTransport:
             raise InvalidValueError.at("url", "grpcs:// or https:// with certificates", url)
         self._shared_memory = SharedMemory(url) if shared_memory else None
         self._connection: Connection | None = None
-        self._left: list[Connection] = []  # perhaps not closed yet
+        self._left: list[Connection] = []  # may not be closed yet
 
     @cached_property
     def _triton(self) -> Any:
@@ -135,7 +135,7 @@ class TritonTransport:
         self, model: str, inputs: Tensors, outputs: Collection[str], request_id: str, timeout_s: float, client: Any
     ) -> Answer:
         requested = [self._triton.InferRequestedOutput(name) for name in outputs]
-        # With queue_timeout_ms exported, Triton drops requests that wait longer in its queue, over HTTP too.
+        # If the export sets queue_timeout_ms, Triton drops requests that wait longer in its queue, over HTTP too.
         waits_us = max(int(timeout_s * _US_PER_S), 1)
         largest = max(inputs, key=lambda name: inputs[name].nbytes)
         lent = nullcontext() if self._shared_memory is None else self._shared_memory.lend(client, inputs[largest])
@@ -170,7 +170,7 @@ class TritonTransport:
     ) -> Answered:
         """Return the answer to ``request`` within ``timeout_s``; ``bad_request`` as in ``triton.error_from``."""
         try:
-            # One limit for gRPC and HTTP. Triton drops a call over gRPC that it cancels, unless scoring has begun.
+            # One limit for gRPC and HTTP. Triton drops a cancelled gRPC call, unless scoring has begun.
             async with timeout(timeout_s):
                 return await self._answer(request)
         except errors.RewardError:
@@ -184,7 +184,7 @@ class TritonTransport:
             raise error from raised
 
     async def _not_served(self, model: str, error: errors.ModelNotFoundError) -> errors.ModelNotFoundError:
-        """The error with the names of served models, if the server tells them in time."""
+        """Return the error with the served models' names, if the server lists them in time."""
         with suppress(Exception):
             async with timeout(_SERVED_TIMEOUT_S):
                 with self._connected().used() as client:
@@ -194,7 +194,7 @@ class TritonTransport:
         return error
 
     async def _answer(self, request: Callable[[Any], Awaitable[Answered]]) -> Answered:
-        """Return the answer. If the call is cancelled over a silent connection, later calls get a new connection."""
+        """Return the answer. If the call is cancelled on a silent connection, later calls get a new connection."""
         connection = self._connected()
         try:
             with connection.used() as client:
@@ -218,19 +218,19 @@ class TritonTransport:
         return self._connection
 
     def _open(self) -> Any:
-        """Return a client with the methods of tritonclient's. It connects at first use, and shows the credentials."""
+        """Return a client with tritonclient's methods. It connects at first use and sends the credentials."""
         raise NotImplementedError
 
 
 class GrpcTransport(TritonTransport):
-    """gRPC transport: a late or cancelled call is cancelled on the server, too, unless scoring has begun.
+    """gRPC transport: a late or cancelled call is also cancelled on the server, unless scoring has begun.
 
     If the host name has several addresses (a headless Service), gRPC spreads the requests over them.
     """
 
     _module = "tritonclient.grpc.aio"
     as_json: ClassVar[dict[str, bool]] = {"as_json": True}
-    _first_process: int | None = None  # first to use gRPC
+    _first_process: int | None = None  # the first process that used gRPC
 
     def __init__(self, url: str, credentials: Credentials, *, shared_memory: bool) -> None:
         super().__init__(url, credentials, shared_memory=shared_memory)

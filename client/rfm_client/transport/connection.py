@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""A connection to a server: its options, its credentials, and what is at fault if the port is wrong.
+"""A connection to a server: its options and credentials, and a diagnosis for wrong ports.
 
-A firewall or a lost machine drops packets without an error. Over gRPC all calls share one connection, so each call
-would run into its deadline. Two rules prevent that by a new connection:
+A firewall or a lost machine drops packets without an error. Over gRPC all calls share one connection, so every call
+would run into its deadline. Two rules open a new connection instead:
 
 - A request whose bytes the peer does not acknowledge within UNACKNOWLEDGED_MS ends the connection. The kernel enforces
   this (TCP_USER_TIMEOUT, which gRPC sets where keepalive is on). The call is sent again over a new connection.
-- If a call runs into its deadline and nothing has come over the connection for SILENT_S, later calls get a new
+- If a call runs into its deadline and nothing has arrived on the connection for SILENT_S, later calls get a new
   connection. This covers peers that acknowledge bytes but do not answer, such as a proxy that hangs.
 
 Pings alone do not suffice. Triton closes a connection after more than two pings less than 300 s apart during which it
-sends nothing, as in a long call. So gRPC pings every PING_MS at most, and only during a call.
+sends nothing, as in a long call. So gRPC pings at most every PING_MS, and only during a call.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ GRPC_OPTIONS: dict[str, int | str] = {
     "grpc.max_reconnect_backoff_ms": 2000,  # default: two minutes, long after a restart
     "grpc.keepalive_time_ms": PING_MS,
     "grpc.keepalive_timeout_ms": UNACKNOWLEDGED_MS,
-    "grpc.use_local_subchannel_pool": 1,  # else a new channel uses the old channel's connection
+    "grpc.use_local_subchannel_pool": 1,  # otherwise a new channel reuses the old channel's connection
 }
 
 
 def grpc_options(address: str) -> list[tuple[str, int | str]]:
-    """Return the options of a gRPC channel to ``host:port``."""
+    """Return the options for a gRPC channel to ``host:port``."""
     options = GRPC_OPTIONS if grpc_proxy(address) else {**GRPC_OPTIONS, "grpc.enable_http_proxy": 0}
     return list(options.items())
 
@@ -83,7 +83,7 @@ class Connection:
 
     @property
     def is_silent(self) -> bool:
-        """True if nothing has come for SILENT_S since a call began."""
+        """True if nothing has arrived for SILENT_S since a call began."""
         return self._silent_since_s is not None and time.monotonic() - self._silent_since_s >= SILENT_S
 
     def leave(self) -> None:
@@ -116,12 +116,12 @@ _VALUE = re.compile("[!-~]([ -~]*[!-~])?")  # visible ASCII, with spaces inside
 
 @dataclass(frozen=True)
 class Credentials:
-    """Credentials of a client. Raises ConfigError for unusable values, without showing a key.
+    """A client's credentials. Raises ConfigError for unusable values, without showing a key.
 
-    ca_file: certificates (PEM) of authorities that may vouch for the server; None: the system's
+    ca_file: CA certificates (PEM) that may vouch for the server; None: the system's
     client_certificate, client_key: files (PEM) that identify this client (mutual TLS); both or neither
-    headers: sent with each request, over gRPC as metadata
-    api_key: sent with each request as ``Authorization: Bearer KEY``
+    headers: sent with every request, over gRPC as metadata
+    api_key: sent with every request as ``Authorization: Bearer KEY``
     """
 
     ca_file: str | Path | None = None
@@ -148,17 +148,17 @@ class Credentials:
 
     @property
     def options(self) -> dict[str, Any]:
-        """The credentials as keyword arguments of a client."""
+        """The credentials as keyword arguments for a client."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @property
     def shown(self) -> dict[str, str]:
-        """All headers, their names in lower case, as gRPC requires."""
+        """All headers, with names in lower case, as gRPC requires."""
         given = {name.lower(): value for name, value in self.headers.items()}
         return given if self.api_key is None else {**given, AUTHORIZATION: f"Bearer {self.api_key}"}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "ssl_context"}  # which no pickle takes
+        return {name: value for name, value in vars(self).items() if name != "ssl_context"}  # which cannot be pickled
 
     @cached_property
     def ssl_context(self) -> ssl.SSLContext:
@@ -167,7 +167,7 @@ class Credentials:
             check_authorities(self.ca_file, "ca_file")
         context = ssl.create_default_context(cafile=self.ca_file)
         if self.client_certificate is not None:
-            assert self.client_key is not None  # by __post_init__
+            assert self.client_key is not None  # checked by __post_init__
             load_certificate(context, self.client_certificate, self.client_key, "client_certificate")
         return context
 
@@ -196,7 +196,7 @@ class Credentials:
 
 LOOK_S = 1.0
 _READ_BYTES = 4096
-_HTTP2_FRAME = "\x00\x00"  # start of a gRPC server's answer to HTTP/1.1
+_HTTP2_FRAME = "\x00\x00"  # a gRPC server's answer to HTTP/1.1 starts with this
 
 
 _GRPC, _HTTP, _METRICS, _GATEWAY = "its gRPC port", "its HTTP port", "its metrics port", "a gateway's"
@@ -205,12 +205,12 @@ OF_A_PORT = (  # errors that a wrong port may cause
     errors.ServerUnavailableError,
     errors.AccessDeniedError,
     errors.InferenceFailedError,
-    errors.ModelNotFoundError,  # a gateway
+    errors.ModelNotFoundError,  # from a gateway
 )
 
 
 def wrong_port(url: str) -> str | None:
-    """Return the fault of the port in a server's URL and its remedy; None: no fault found."""
+    """Say what is wrong with the port in a server's URL and how to fix it; None: no fault found."""
     scheme, address = split_url(url)
     protocol = scheme.removesuffix("s")
     right, expected, usual = _EXPECTED[protocol]
@@ -233,7 +233,7 @@ def wrong_port(url: str) -> str | None:
 
 
 def _port_at(address: str) -> str | None:
-    """Kind of port, for a message; None: unknown."""
+    """Return the kind of port, for a message; None: unknown."""
     try:
         if _read(address, "/v2").startswith(b"{"):
             return _HTTP
@@ -255,13 +255,13 @@ def _speaks_tls(address: str) -> bool:
         with socket.create_connection(place, LOOK_S) as plain, context.wrap_socket(plain):
             return True
     except ssl.SSLError as error:
-        return "ALERT" in (error.reason or "")  # refuses the handshake, but in TLS
+        return "ALERT" in (error.reason or "")  # refuses the handshake, but speaks TLS
     except (OSError, UnicodeError):
         return False
 
 
 def _read(address: str, path: str) -> bytes:
-    """The beginning of a page; empty if the page is missing."""
+    """Return the beginning of a page; empty if the page is missing."""
     connection = http.client.HTTPConnection(address, timeout=LOOK_S)
     try:
         connection.request("GET", path)

@@ -16,14 +16,14 @@ from rfm_client.contract import triton
 from rfm_client.transport.connection import SECURE_SCHEMES, Credentials
 from rfm_client.transport.threads import MIN_BYTES
 
-_AS_IT_IS = {"Accept-Encoding": "identity"}  # else aiohttp asks for gzip, which hardly shrinks floats
+_AS_IT_IS = {"Accept-Encoding": "identity"}  # otherwise aiohttp asks for gzip, which hardly shrinks floats
 
 
 class HttpClient(InferenceServerClient):  # type: ignore[misc]  # untyped
     """Connections to one server, one for each concurrent call, for one event loop. The caller has a deadline.
 
-    Unlike its base, it does not block the event loop while it sends large arrays, and follows no redirect, which would
-    carry frames and headers to another server.
+    Unlike the base class, this client does not block the event loop while sending large arrays. It follows no redirect,
+    which would carry frames and headers to another server.
     """
 
     def __init__(self, scheme: str, address: str, credentials: Credentials) -> None:
@@ -44,9 +44,9 @@ class HttpClient(InferenceServerClient):  # type: ignore[misc]  # untyped
     async def _ask(self, method: str, path: str, body: bytes, headers: Mapping[str, Any] | None) -> Any:
         """Return aiohttp's answer, with its content read.
 
-        Raises InferenceFailedError for a redirect, InferenceServerException for an error but of readiness.
+        Raises InferenceFailedError for a redirect, InferenceServerException for an error other than unreadiness.
         """
-        # aiohttp sends a stream piece by piece. Large bytes would block the event loop, and aiohttp warns.
+        # aiohttp sends a stream piece by piece. Large bytes would block the event loop, and aiohttp warns about them.
         data = io.BytesIO(body) if len(body) >= MIN_BYTES else body or None
         every = {**self._own_headers, **self._fix_header(headers or {})}
         url = f"{self._url}/{path}"
@@ -61,7 +61,7 @@ class HttpClient(InferenceServerClient):  # type: ignore[misc]  # untyped
 
 
 def _reason(content: bytes) -> str:
-    """Return Triton's reason for an error; else the text of the answer, which may be a proxy's."""
+    """Return Triton's reason for an error; otherwise the answer's text, which may be a proxy's."""
     try:
         return str(json.loads(content)["error"])
     except (ValueError, LookupError, TypeError):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Limits of calls: their time, the size of a request, and what is on its way at a time."""
+"""Limits on calls: time, request size, and how much may be in flight at once."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from rfm_client.contract.checks import checked_count, checked_positive
 from rfm_client.contract.errors import DeadlineExceededError, InvalidSampleError
 from rfm_client.contract.wire import Tensors
 
-MAX_REQUEST_BYTES = 2**31 - 2**16  # gRPC and Triton's HTTP server count a message's bytes in 32 bits; rest: headers
+MAX_REQUEST_BYTES = 2**31 - 2**16  # gRPC and Triton's HTTP server count message bytes in 32 bits; rest: headers
 _BYTES_PER_GB = 1e9
-_LENGTH_BYTES = 4  # before each text
-MAX_BYTES = 256 * 2**20  # of inputs; writing to a socket holds several copies of them
+_LENGTH_BYTES = 4  # before every text
+MAX_BYTES = 256 * 2**20  # input bytes; writing to a socket holds several copies
 MAX_TIMEOUT_S = 1e9  # more than 30 years; Triton counts nanoseconds, and not many more
 
 
@@ -34,7 +34,7 @@ def check_timeout(timeout_s: float) -> None:
 
 
 class Deadline:
-    """A moment ``timeout_s`` seconds from now, for all steps of a call. at_s: the moment (monotonic clock)"""
+    """A moment ``timeout_s`` seconds from now, for all steps in a call. at_s: the moment (monotonic clock)."""
 
     def __init__(self, timeout_s: float) -> None:
         check_timeout(timeout_s)
@@ -53,14 +53,14 @@ class Deadline:
         return remaining_s
 
     def exceeded(self, where: str = "") -> DeadlineExceededError:
-        """Return the error of a call that ran out of time at the server ``where``."""
+        """Return the error for a call that ran out of time at the server ``where``."""
         return DeadlineExceededError(f"{where}{': ' if where else ''}no answer within {self.timeout_s:g} s")
 
 
 def check_size(inputs: Tensors, shared: Collection[str]) -> None:
-    """Raise InvalidSampleError if the inputs outside of shared memory do not fit into one request.
+    """Raise InvalidSampleError if the inputs outside shared memory do not fit into one request.
 
-    shared: names of the inputs in shared memory
+    shared: names of inputs in shared memory
     """
     sizes = {name: _num_bytes(inputs, name) for name in inputs if name not in shared}
     if sum(sizes.values()) <= MAX_REQUEST_BYTES:
@@ -82,7 +82,7 @@ def _num_bytes(inputs: Tensors, name: str) -> int:
 
 
 class ConcurrencyLimiter:
-    """A limit of ``max_requests`` requests and MAX_BYTES at a time, for one event loop. First come, first served."""
+    """Allows at most ``max_requests`` requests and MAX_BYTES at a time, in one event loop. First come, first served."""
 
     def __init__(self, max_requests: int) -> None:
         self._free_requests = checked_count("max_in_flight", max_requests)
@@ -92,7 +92,7 @@ class ConcurrencyLimiter:
 
     @asynccontextmanager
     async def room(self, num_bytes: int, deadline: Deadline) -> AsyncIterator[None]:
-        """Context manager for a request of ``num_bytes``. A request over MAX_BYTES runs alone.
+        """Context manager for a request with ``num_bytes``. A request over MAX_BYTES runs alone.
 
         Raises DeadlineExceededError if there is no room in time.
         """
@@ -117,5 +117,5 @@ class ConcurrencyLimiter:
                 while not self._fits(num_bytes):
                     self._left.clear()
                     await self._left.wait()
-        except asyncio.TimeoutError:  # not the built-in class in Python 3.10
+        except asyncio.TimeoutError:  # in Python 3.10 not the built-in class
             raise deadline.exceeded() from None

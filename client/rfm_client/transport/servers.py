@@ -2,10 +2,10 @@
 """Servers with one checkpoint, and the retry loop for a request.
 
 The least busy server gets a request, unless the caller names the one to ask first. A server that fails is left out
-until it reports ready; after more failures, it is asked later. A score depends on the request alone, so a request may
-be sent twice:
+until it reports ready; the more often it has failed, the later it is asked. A score depends on the request alone, so a
+request may be sent twice:
 
-- the server is down, restarting or full: retry at once at another server, else after growing pauses
+- the server is down, restarting or full: retry at once on another server, else after growing pauses
 - a process or the connection ended, perhaps because of this request: retry once, when a server can be back. So a
   request ends at most two processes
 - the server denies access, fails, or lacks the model: try each other server once
@@ -45,9 +45,9 @@ Request = Callable[[Transport, float], Awaitable[Answered]]
 
 FIRST_PAUSE_S = 0.1
 LONGEST_PAUSE_S = 2.0
-LONGEST_REST_S = 30.0  # of a server that reports ready but keeps failing
+LONGEST_REST_S = 30.0  # longest pause before probing a server that reports ready but keeps failing
 RESTART_S = 15.0  # longer than `rfm serve` takes to notice that a process ended and to restart Triton
-SPREAD_S = 1.0  # spread of retries, so that a request that ends its process again takes few others with it
+SPREAD_S = 1.0  # spreads retries, so that a request that ends its process again takes few others with it
 PROBE_TIMEOUT_S = 2.0
 _POLL_S = 0.2
 
@@ -76,7 +76,7 @@ class KnownServer:
         return self.comeback is not None and not self.comeback.done()
 
     async def answer(self, request: Request[Answered], moment: int, left_s: float) -> Answered:
-        """Return the server's answer. moment: number of the request, which breaks ties between servers"""
+        """Return the server's answer. moment: request number, which breaks ties between servers."""
         self.outstanding += 1
         self.last_request = moment
         try:
@@ -85,7 +85,7 @@ class KnownServer:
             self.outstanding -= 1
 
     async def rested(self, model: str) -> None:
-        """Return when the failed server reports ready, after a pause that grows with each failure."""
+        """Pause, longer after each failure, then wait until the server reports ready."""
         await asyncio.sleep(pause_s(self.failures - 1, LONGEST_REST_S))
         for attempt in itertools.count():
             if await self.transport.is_ready(model, PROBE_TIMEOUT_S):
@@ -93,9 +93,9 @@ class KnownServer:
             await asyncio.sleep(pause_s(attempt, LONGEST_PAUSE_S))
 
     async def back(self, model: str, *, was_down: bool) -> None:
-        """Return when the server is ready again after a process or the connection ended.
+        """Wait until the server is ready again after a process or the connection ended.
 
-        Triton 2.51 reports a dead model as ready. So wait for RESTART_S, or until the server has reported the opposite.
+        Triton 2.51 reports a dead model as ready. So wait for RESTART_S, or until the server has reported not ready.
         """
         until_s = time.monotonic() + RESTART_S
         while True:
@@ -113,7 +113,7 @@ class KnownServer:
 
 
 class Servers:
-    """Several servers that share the requests, for one event loop. retry: True: send failed requests again"""
+    """Several servers that share the requests, for one event loop. retry: True: send failed requests again."""
 
     def __init__(self, transports: Sequence[Transport], *, retry: bool) -> None:
         require("url", len(transports) > 0, "at least one", "none")
@@ -138,7 +138,7 @@ class Servers:
         request_id: str,
         first: int | None = None,
     ) -> Answer:
-        """Return the named ``outputs`` of ``model`` for ``inputs``. Raises RewardError with the request's id.
+        """Return the named ``outputs`` that ``model`` gives for ``inputs``. Raises RewardError with the request id.
 
         first: index of the server to ask; after a failure, the next in the list. None: the least busy
         """
@@ -174,7 +174,7 @@ class Servers:
         return infos
 
     async def is_ready(self, models: Sequence[str], timeout_s: float) -> bool:
-        """True as soon as a server has one of the models ready; False if none has."""
+        """True as soon as any server has any model in ``models`` ready; False if none has."""
         probes = [
             asyncio.ensure_future(server.transport.is_ready(model, timeout_s))
             for server in self._servers
@@ -190,13 +190,13 @@ class Servers:
                 probe.cancel()
 
     async def check_ports(self) -> None:
-        """Raise ServerUnavailableError if every URL has a wrong port: waiting would not help."""
+        """Raise ServerUnavailableError if all URLs have a wrong port: waiting would not help."""
         named = await self._wrong_ports()
         if named and named[0] is not None and all(named):
             raise ServerUnavailableError(named[0])
 
     def stop_retrying(self) -> None:
-        """Make later failures end their calls at once, without a message in the log."""
+        """Let later failures end their calls at once, without a message in the log."""
         self._retry = False
 
     async def close(self) -> None:
@@ -214,7 +214,7 @@ class Servers:
             return await self._until_answered(model, request, deadline, first)
         except (asyncio.CancelledError, Exception) as error:
             clear_variables(error)
-            if self._is_closed and not _is_task_cancelled():  # connections that close raise errors of many classes
+            if self._is_closed and not _is_task_cancelled():  # closing connections raise errors from many classes
                 raise ClientClosedError("this client was closed during the call") from error
             if isinstance(error, OF_A_PORT) and not any(server.has_answered for server in self._servers):
                 for named in filter(None, await self._wrong_ports()):
@@ -227,7 +227,7 @@ class Servers:
         """Run the loop that the module describes."""
         refusals: dict[KnownServer, RewardError] = {}
         failures: dict[KnownServer, ServerUnavailableError] = {}
-        has_ended = False  # True: a process or the connection, during this request
+        has_ended = False  # True: a process or the connection ended during this request
         for attempt in itertools.count():
             server = self._best(refusals, first)
             left_s = deadline.remaining_s()
@@ -237,7 +237,7 @@ class Servers:
                 self._leave_out(server, model, error)
                 failed = failures.get(server)
                 if failed is not None and left_s < deadline.timeout_s / 2:
-                    raise failed from failed.__cause__  # the reason for most of the lost time
+                    raise failed from failed.__cause__  # this failure took most of the time
                 raise deadline.exceeded(error.server or server.transport.url) from error
             except (AccessDeniedError, InferenceFailedError, ModelNotFoundError) as error:
                 refusals[server] = error
@@ -265,14 +265,14 @@ class Servers:
                 if not self._retry or deadline.ends_within(wait_s):
                     raise
                 await asyncio.sleep(wait_s)
-                if deadline.ends_within(0):  # the pause took longer than it should have
+                if deadline.ends_within(0):  # the pause took longer than planned
                     raise
             else:
                 server.failures, server.has_answered = 0, True
                 for other, refusal in refusals.items():  # not before: if all refuse, no server is at fault
                     self._leave_out(other, model, refusal)
                 return answer
-        raise min(refusals.values(), key=lambda error: isinstance(error, ModelNotFoundError))  # says least
+        raise min(refusals.values(), key=lambda error: isinstance(error, ModelNotFoundError))  # which says least
 
     def _best(self, avoided: Collection[KnownServer], first: int | None) -> KnownServer:
         """Return the server to ask next: ``first`` or the next one that works; without ``first``, the least busy."""
@@ -287,7 +287,7 @@ class Servers:
     def _leave_out(self, server: KnownServer, model: str, error: RewardError) -> None:
         """Leave the server out until it is ready. A single server still gets requests."""
         if server.is_left_out or self._is_closed:
-            return  # the same failure, or none
+            return  # the same failure, or closing
         server.failures += 1
         if error.may_have_ended_server:
             was_down = not isinstance(error, ProcessEndedError)
@@ -296,18 +296,18 @@ class Servers:
             server.comeback = asyncio.create_task(server.rested(model))
 
     async def _wrong_ports(self) -> list[str | None]:
-        """Fault of each server's port; None: no fault found."""
+        """Return what is wrong with each server's port; None: no fault found."""
         ours = [server.transport.url for server in self._servers if isinstance(server.transport, TritonTransport)]
         return [await asyncio.to_thread(wrong_port, url) for url in ours]
 
 
 def _is_task_cancelled() -> bool:
-    """True if the caller cancelled the task that runs, as Python 3.11 and later tell."""
+    """True if the caller cancelled the running task; known only since Python 3.11."""
     task = asyncio.current_task()
     return bool(task is not None and getattr(task, "cancelling", int)())
 
 
 def pause_s(attempt: int, longest_s: float) -> float:
-    """Return a pause that doubles with each try; up to half is random, lest callers return together."""
+    """Return a pause that doubles with each try, up to half of it jitter, so that callers don't retry at once."""
     pause_s = min(longest_s, FIRST_PAUSE_S * 2.0 ** min(attempt, 16))
     return random.uniform(pause_s / 2, pause_s)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """System shared memory: large inputs reach a server on the same host without a socket.
 
-Requests use the regions of a pool in turn. A region is registered with the server, and its name leaves /dev/shm once
-the server has mapped it. So a crash of this process leaves no data there, only the server's mapping until a restart.
+Requests take turns using a pool of regions. A region is registered with the server, and its name leaves /dev/shm once
+the server has mapped it. So if this process crashes, no data stays there, only the server's mapping until a restart.
 
 Not ``tritonclient.utils.shared_memory``: its regions keep their names, and they are sparse, so that a full /dev/shm
-kills the process that writes (SIGBUS).
+kills the writing process (SIGBUS).
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from rfm_client.transport.limits import timeout
 from rfm_client.transport.threads import off_loop
 
 FOLDER = Path("/dev/shm")
-MIN_SHARED_BYTES = 64 * 2**10  # smaller inputs are faster in the request itself
+MIN_SHARED_BYTES = 64 * 2**10  # smaller inputs travel faster in the request itself
 MIN_REGION_BYTES = 2**20
-CLOSE_TIMEOUT_S = 2.0  # for the server to unmap all regions, some perhaps in use
+CLOSE_TIMEOUT_S = 2.0  # for the server to unmap all regions, which may still be in use
 IN_USE_PAUSE_S = 0.02  # between tries to unmap a region that a request still uses
 
 logger = logging.getLogger("rfm_client")
 
 
 class Region:
-    """Memory that the server maps too. generation: number of server restarts noticed before"""
+    """Memory that the server also maps. generation: how many server restarts were noticed before."""
 
     def __init__(self, name: str, byte_size: int, generation: int) -> None:
         self.name, self.byte_size, self.generation = name, byte_size, generation
         descriptor = os.open(FOLDER / name, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_CLOEXEC, 0o600)
         try:
-            os.posix_fallocate(descriptor, 0, byte_size)  # raises OSError now where a write would raise SIGBUS later
+            os.posix_fallocate(descriptor, 0, byte_size)  # raises OSError now, where a write would raise SIGBUS later
             self._memory = mmap.mmap(descriptor, byte_size)
         except OSError:
             self.unlink()
@@ -65,7 +65,7 @@ class Region:
 class SharedMemory:
     """The regions that this process shares with the server at ``url``, for one event loop.
 
-    ``client`` is a tritonclient asyncio client of that server.
+    ``client`` is a tritonclient asyncio client for that server.
     """
 
     def __init__(self, url: str) -> None:
@@ -124,7 +124,7 @@ class SharedMemory:
         except OSError as error:
             self._give_up(str(error))
             return None
-        self._registered.add(region.name)  # now, since a cancelled call may still map it
+        self._registered.add(region.name)  # now, because a cancelled call may still map it
         try:
             await client.register_system_shared_memory(region.name, f"/{region.name}", size)
         except InferenceServerException as error:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The state of a Triton server: models, work and devices. Read-only.
+"""Triton's current status: models, work and devices. Read-only.
 
-Where the repository's index needs a key (``rfm serve``), only loaded models are listed.
+Where the repository index needs a key (``rfm serve``), only loaded models are listed.
 """
 
 from __future__ import annotations
@@ -27,33 +27,33 @@ from rfm_client.transport.connection import OF_A_PORT, Credentials, wrong_port
 METRICS_PORT = 8002
 METRICS_OPTION = "--metrics-url"
 _PROCESSOR = "CPU"
-_FRAMES = frames_name("")  # end of the names of models for raw frames
+_FRAMES = frames_name("")  # ends the names of models for raw frames
 PENDING_METRIC = "nv_inference_pending_request_count"
 
 _DEVICE_METRIC = re.compile("nv_(cpu|gpu)_(utilization|memory_used_bytes|memory_total_bytes)")
 _REQUESTS_METRIC = "nv_inference_request_success_total"
 _COMPUTE_METRIC = "nv_inference_compute_infer_duration_us_total"
 _BATCH_SAMPLES_METRIC = "rfm_batch_samples"
-_SAMPLES_METRIC, _REFUSED = "rfm_samples_total", "refused"  # a value of the label ``outcome``
+_SAMPLES_METRIC, _REFUSED = "rfm_samples_total", "refused"  # a value for the label ``outcome``
 _SCORING_METRICS = ("rfm_collate_seconds", "rfm_forward_seconds")
 _SAMPLED_METRIC = "nv_cpu_memory_used_bytes"
-_SAMPLING_S = 2.5  # Triton measures devices every two seconds; before, it reports zeros
+_SAMPLING_S = 2.5  # Triton measures devices every two seconds; before the first time, it reports zeros
 _POLL_S = 0.2
 _REASON_CHARACTERS = 120
-_STATES = {True: "READY", False: "UNAVAILABLE"}  # of a loaded model
+_STATES = {True: "READY", False: "UNAVAILABLE"}  # for a loaded model
 _NS_PER_MS = 1e6
 _MS_PER_S = 1e3
 _US_PER_S = 1e6
 
-_Version: TypeAlias = tuple[str, str]  # name and version of a model
-_Told: TypeAlias = tuple[  # version, readiness, and the entry and statistics of each model
+_Version: TypeAlias = tuple[str, str]  # a model's name and version
+_Told: TypeAlias = tuple[  # version, readiness, and every model's index entry and statistics
     str, bool, dict[_Version, tuple[Mapping[str, Any], Mapping[str, Any]]]
 ]
 
 
 @dataclass(frozen=True)
 class Batches:
-    """Batches of callers' requests, as a model reports them for all instances.
+    """Batches from callers' requests, as a model reports them for all instances.
 
     count, samples: how many batches and samples
     scoring_ms: total time for collating and forward passes
@@ -68,7 +68,7 @@ class Batches:
 class ModelStatus:
     """One version of a model.
 
-    Triton counts from the load of the model, warm-up included. The model counts ``batches`` and ``samples_refused``
+    Triton counts from when the model was loaded, warm-up included. The model counts ``batches`` and ``samples_refused``
     from Triton's start. A model that prepares ahead forms its own batches, which only ``batches`` counts.
 
     requests_pending: requests in Triton's queue now; None: not in the metrics
@@ -95,7 +95,7 @@ class ModelStatus:
 
     @property
     def batch_count(self) -> int:
-        """Number of callers' batches; before the first, number of executions."""
+        """How many batches callers' requests formed; before the first, how many executions ran."""
         return self.batches.count if self.batches and self.batches.count else self.executions
 
     @property
@@ -106,18 +106,18 @@ class ModelStatus:
 
     @property
     def queue_ms_per_request(self) -> float | None:
-        """Mean time of a request in Triton's queue; None: no request yet."""
+        """Mean time that a request spends in Triton's queue; None: no request yet."""
         return self.queue_ms / self.requests_succeeded if self.requests_succeeded else None
 
     @property
     def compute_ms_per_batch(self) -> float | None:
-        """Mean time of a batch; None: no batch yet."""
+        """Mean time per batch; None: no batch yet."""
         total_ms = self.batches.scoring_ms if self.batches and self.batches.count else self.compute_ms
         return total_ms / self.batch_count if self.batch_count else None
 
     @property
     def busy_ms(self) -> float:
-        """Time of the model's work on all devices. Triton omits work for which it did not wait."""
+        """Time that the model worked on all devices. Triton omits work that it did not wait for."""
         return max(self.compute_ms, self.batches.scoring_ms if self.batches else 0.0)
 
 
@@ -138,10 +138,10 @@ class Device:
 
 @dataclass(frozen=True)
 class DeviceWork:
-    """The work of one model, all versions, on one device.
+    """One model's work on one device, over all versions.
 
-    requests: number of answered requests
-    compute_s: seconds of computation; a batch counts once for each of its requests
+    requests: answered requests
+    compute_s: computing time in seconds; a batch counts once per request
     """
 
     requests: int
@@ -150,7 +150,7 @@ class DeviceWork:
 
 @dataclass(frozen=True)
 class ServerStatus:
-    """State of a responding server.
+    """A responding server's status.
 
     metrics_error: why ``devices`` and other metrics are missing; None: they are not
     """
@@ -172,8 +172,7 @@ class ServerStatus:
         timeout_s: float = 60.0,
         credentials: Credentials | None = None,
     ) -> ServerStatus:
-        """Return the state of a server at ``grpc://host:port`` or ``http://host:port``, with TLS ``grpcs://`` or
-        ``https://``.
+        """Return the status of the server at ``grpc://host:port`` or ``http://host:port`` (TLS: ``grpcs``, ``https``).
 
         metrics_url: where to read metrics; None: port METRICS_PORT on the same host. Unreadable metrics are left out
         credentials: used for the server, not for the metrics
@@ -196,7 +195,7 @@ class ServerStatus:
 
     @property
     def checkpoints(self) -> list[str]:
-        """Names of the exported checkpoints whose model for raw frames is ready, in alphabetical order."""
+        """Names of exported checkpoints whose model for raw frames is ready, in alphabetical order."""
         ready = {model.name for model in self.models if model.state == "READY"}
         return sorted(name.removesuffix(_FRAMES) for name in ready if name.endswith(_FRAMES))
 
@@ -211,7 +210,7 @@ class _Metrics:
 
 
 async def _state(url: str, timeout_s: float, credentials: Credentials | None) -> _Told:
-    """Return the server's version, whether it is ready, and the entry in its index and the statistics of each model."""
+    """Return the server's version, whether it is ready, and every model's index entry and statistics."""
     transport = connect(url, credentials=credentials)
 
     async def request(client: Any) -> _Told:
@@ -219,7 +218,7 @@ async def _state(url: str, timeout_s: float, credentials: Credentials | None) ->
         statistics = (await client.get_inference_statistics(**transport.as_json)).get("model_stats", [])
         try:
             answer = await client.get_model_repository_index(**transport.as_json)
-            index = answer if isinstance(answer, list) else answer.get("models", [])  # gRPC's is nested
+            index = answer if isinstance(answer, list) else answer.get("models", [])  # nested in gRPC's answer
         except InferenceServerException as error:
             if triton.RESTRICTED not in (error.message() or ""):
                 raise
@@ -243,12 +242,12 @@ async def _state(url: str, timeout_s: float, credentials: Credentials | None) ->
 def _model(
     entry: Mapping[str, Any], done: Mapping[str, Any], known: Collection[_Version], metrics: _Metrics
 ) -> ModelStatus:
-    """Return the state of one version. known: all versions of all models"""
+    """Return the status of one version. known: all versions of all models."""
     key = entry["name"], entry.get("version", "")
     times = done.get("inference_stats", {})
     encoder = encoder_name(key[0].removesuffix(_FRAMES))
     is_ensemble = key[0].endswith(_FRAMES) and encoder in {name for name, _ in known}
-    failures = 2 if is_ensemble else 1  # that Triton counts for a failed request
+    failures = 2 if is_ensemble else 1  # how often Triton counts a failed request
     return ModelStatus(
         name=key[0],
         version=key[1],
@@ -268,7 +267,7 @@ def _model(
 
 
 def _whole(statistics: Mapping[str, Any], name: str, key: str) -> int:
-    """A count: gRPC omits zeros and writes others as text."""
+    """Return a count: gRPC omits zeros and writes other counts as text."""
     return int(statistics.get(name, {}).get(key, 0))
 
 
@@ -307,7 +306,7 @@ def _scrape(url: str, timeout_s: float) -> list[Any]:
 
 
 def _totals(samples: list[Any], *names: str) -> dict[_Version, float]:
-    """The sum of these metrics over all instances, by version."""
+    """Return the sum of these metrics over all instances, by version."""
     totals: dict[_Version, float] = {}
     for sample in samples:
         if sample.name in names:
@@ -317,7 +316,7 @@ def _totals(samples: list[Any], *names: str) -> dict[_Version, float]:
 
 
 def _devices(samples: list[Any]) -> tuple[Device, ...]:
-    """The devices and each model's work there. A count without a GPU is the processor's."""
+    """Return the devices, with the work done there by each model. A count without a GPU belongs to the processor."""
     values: dict[str, dict[str, float]] = {}
     work: dict[str, dict[str, DeviceWork]] = {}
     for sample in samples:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Threads and event loops of a client; bases of objects with connections."""
+"""A client's threads and event loops; base classes for objects with connections."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Arguments = ParamSpec("Arguments")
 Returned = TypeVar("Returned")
 
-MIN_BYTES = 2**20  # a smaller copy takes no longer than a change of thread
+MIN_BYTES = 2**20  # copying less takes no longer than switching threads
 
 
 class OneProcess:
@@ -35,7 +35,7 @@ class Closing:
     """A context manager that closes itself."""
 
     def close(self) -> None:
-        """Release the resources of this object."""
+        """Release this object's resources."""
         raise NotImplementedError
 
     def __enter__(self) -> Self:
@@ -49,7 +49,7 @@ class AsyncClosing:
     """An async context manager that closes itself."""
 
     async def close(self) -> None:
-        """Release the resources of this object."""
+        """Release this object's resources."""
         raise NotImplementedError
 
     async def __aenter__(self) -> Self:
@@ -85,8 +85,8 @@ class LoopThread:
     def start(self, coroutine: Coroutine[Any, Any, Returned]) -> Future[Returned]:
         """Return the coroutine's future, which can cancel it.
 
-        Raises ClientClosedError after ``stop``, as does the future of a coroutine that ``stop`` cancelled, and
-        RuntimeError in a fork.
+        Raises ClientClosedError after ``stop``, and RuntimeError in a fork. If ``stop`` cancels the coroutine, the
+        future also raises ClientClosedError.
         """
         error: RuntimeError = ClientClosedError("this RewardClient is closed")
         if os.getpid() != self._process_id:
@@ -111,11 +111,11 @@ class LoopThread:
             clear_variables(error)
             raise
         finally:
-            future.cancel()  # after an interrupt; without effect on a finished future
+            future.cancel()  # after an interrupt; does nothing on a finished future
             del future  # it holds the error
 
     def stop(self, last: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Cancel all coroutines, run ``last``, and end the thread. Without effect in a fork, which lacks the thread."""
+        """Cancel all coroutines, run ``last``, and end the thread. Does nothing in a fork, which lacks the thread."""
         if os.getpid() != self._process_id:
             return
         with self._starting:
@@ -149,7 +149,7 @@ class LoopThread:
             await last()
         finally:
             self._workers.shutdown(wait=False)
-            # A TLS connection whose call was cancelled waits for its peer's goodbye, which comes too late or never.
+            # After a cancelled call, a TLS connection waits for its peer's goodbye, which comes too late or never.
             for transport in [*getattr(self._loop, "_transports", {}).values()]:
                 transport.abort()
             self._loop.call_soon(self._loop.stop)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Conversion of results to tensors and back."""
+"""Convert results to tensors and back."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from rfm_client.contract.wire.specs import PREFERENCE, SIMILARITY, TIMING_MS, Te
 
 
 def outputs_for(samples: Sequence[Sample], given: Collection[str] = (), *, all_scores: bool = False) -> tuple[str, ...]:
-    """Return the names of the scores that these samples ask for. Others would be NaN, and cost their transfer.
+    """Return the scores that these samples ask for. Others would be NaN and waste bandwidth.
 
-    given: scores of frames that the model gives, as its description says
-    all_scores: True: also those that an option of a call asks for, but not those of progress bins
+    given: frame scores that the model gives, according to its description
+    all_scores: True: add scores that a call option requests, except those for progress bins
     """
     kinds = set(map(type, samples))
     asked_by = {PREFERENCE: PreferenceSample, SIMILARITY: SimilaritySample}
@@ -50,11 +50,11 @@ def encode_results(results: Sequence[Result], num_positions: int, outputs: Colle
 def decode_results(
     tensors: Mapping[str, npt.NDArray[Any]], samples: Sequence[Sample], model_version: str | None = None
 ) -> list[Result]:
-    """Return the results of the samples of one request, which ``model_version`` answered.
+    """Return results for the samples in one request, which ``model_version`` answered.
 
-    Raises InferenceFailedError if the answer lacks a score: a missing reward is not 0 or NaN. Only a score that a
-    checkpoint need not predict (success, and progress where remaining seconds are there) may be NaN, at all frames.
-    Progress and ``hop`` may be NaN at the same frames, which the model did not answer about.
+    Raises InferenceFailedError if the answer lacks a score: a missing reward is not 0 or NaN. Only scores that a
+    checkpoint need not predict (success, and progress where remaining seconds are present) may be NaN, at all frames.
+    Progress and ``hop`` may be NaN at the same frames, for which the model gave no answer.
     """
     return [_decode_result(tensors, row, sample, model_version) for row, sample in enumerate(samples)]
 
@@ -62,7 +62,7 @@ def decode_results(
 def decode_progress(
     tensors: Mapping[str, npt.NDArray[Any]], row: int, num_frames: int, model_version: str | None = None
 ) -> ProgressResult:
-    """Return the result of the progress sample in ``row``, of ``num_frames``. Raises InferenceFailedError."""
+    """Return the result for the progress sample in ``row``, with ``num_frames``. Raises InferenceFailedError."""
     scores = vars(_scores_between(tensors, row, slice(0, num_frames)))
     return ProgressResult(**scores, timing=_timing(tensors, row), model_version=model_version)
 
@@ -126,11 +126,11 @@ def _present(
     may_lack: bool = False,
     answered_as: str | None = None,
 ) -> Float32Array:
-    """One row's scores at some positions. Raises InferenceFailedError unless all are present and finite.
+    """Return one row's scores at some positions. Raises InferenceFailedError unless all are present and finite.
 
     may_lack: True: all may be NaN, if the checkpoint does not predict them
-    answered_as: the score that is NaN at the same frames, which the model does not answer about; the last frame always
-        has an answer
+    answered_as: score that is NaN at the same frames, for which the model gives no answer; the last frame always has an
+        answer
     """
     scores, count = tensors[name], positions.stop - positions.start
     if scores.ndim < 2 or row >= len(scores):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Conversion of samples to tensors and back: requests to reward models and encoders, answers of encoders."""
+"""Convert samples to tensors and back: requests to reward models and encoders, and encoders' answers."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from rfm_client.contract.wire.specs import (
 
 Decoded = TypeVar("Decoded")
 Row: TypeAlias = dict[str, npt.NDArray[Any]]  # tensors of one sample
-Known: TypeAlias = Mapping[Any, npt.NDArray[Any]]  # pixels, or embeddings, of frames by digest
+Known: TypeAlias = Mapping[Any, npt.NDArray[Any]]  # pixels or embeddings by frame digest
 Kept: TypeAlias = Callable[[Iterable[bytes]], Known]  # returns what a server keeps of these frames
 
 _SAMPLE_TYPES = {
@@ -55,9 +55,9 @@ _SAMPLE_TYPES = {
 
 
 def encode_samples(samples: Sequence[Sample]) -> Tensors:
-    """Return one request. Apart from time, all first trajectories need one shape, and all second trajectories, too.
+    """Return one request. Apart from time, all first trajectories must share one shape, and so must all second ones.
 
-    All samples need the same views and goal, of the same shapes, or none.
+    The samples must agree on which views and goal they have, and on the shapes.
     """
     tensors: Tensors = {
         SAMPLE_TYPE: np.array([[_SAMPLE_TYPES[type(sample)]] for sample in samples], np.uint8),
@@ -82,15 +82,15 @@ def encode_samples(samples: Sequence[Sample]) -> Tensors:
 
 
 def decode_samples(tensors: Mapping[str, npt.NDArray[Any]], kept: Kept | None = None) -> list[Sample]:
-    """Return the samples of one request. Raises InvalidSampleError, which names the sample and the field.
+    """Return the samples in one request. Raises InvalidSampleError, which names the sample and the field.
 
-    kept: finds the pixels that the model keeps of frames; None: it keeps none
+    kept: finds frame pixels that the model keeps; None: it keeps none
     """
     return _decode_rows(tensors, kept, _decode_sample)
 
 
 def encode_frames(trajectory: Trajectory) -> Tensors:
-    """Return a request to the encoder for one trajectory of raw frames. The encoder refuses what it does not read."""
+    """Return an encoder request for one trajectory of raw frames. The encoder refuses what it does not read."""
     tensors = encode_samples([ProgressSample(trajectory)])
     return {name: tensor for name, tensor in tensors.items() if name not in (SAMPLE_TYPE, FRAME_STEPS)}
 
@@ -107,17 +107,17 @@ def decode_embeddings(tensors: Mapping[str, npt.NDArray[Any]], trajectory: Traje
 
 
 def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]], kept: Kept | None = None) -> list[EncoderSample]:
-    """Return the trajectories of each sample, without padding, for the encoder. Raises InvalidSampleError.
+    """Return the trajectories in each sample, without padding, for the encoder. Raises InvalidSampleError.
 
-    kept: finds the embeddings that the model keeps of frames; None: it keeps none
+    kept: finds frame embeddings that the model keeps; None: it keeps none
     """
     return _decode_rows(tensors, kept, _decode_encoder_sample)
 
 
 def encode_refs(videos: Sequence[Sequence[bytes]], tasks: Sequence[str], sent: Sequence[UInt8Array]) -> Tensors:
-    """Return one request for the progress of videos whose frames are named by their digests.
+    """Return one progress request for videos whose frames are named by their digests.
 
-    videos, tasks: the digests of the frames of each video, and its task
+    videos, tasks: frame digests and a task for each video
     sent: frames that the model may lack, uint8 [H, W, 3] of one size; empty: it has all frames
     """
     count = len(videos)
@@ -156,7 +156,7 @@ def _lengths(sample: Sample) -> tuple[int, int]:
 def _decode_rows(
     tensors: Mapping[str, npt.NDArray[Any]], kept: Kept | None, decode: Callable[[Row, Known], Decoded]
 ) -> list[Decoded]:
-    """Decode each sample. The digests of the request's pixels are computed here, whatever the caller calls them."""
+    """Decode all samples. The digests for the request's pixels are computed here, whatever the caller calls them."""
     known: Known = {}
     if FRAME_DIGESTS in tensors:
         if SECOND_FRAMES in tensors:
@@ -221,7 +221,7 @@ def _trajectory(row: Row, positions: npt.NDArray[Any], known: Known) -> Trajecto
 
 
 def _named(digests: Sequence[bytes], known: Known) -> tuple[NamedFrame, ...]:
-    """Return what is known of each frame. Raises InvalidSampleError for unknown frames or unequal sizes."""
+    """Return what is known about each frame. Raises InvalidSampleError for unknown frames or unequal sizes."""
     unknown = sum(digest not in known for digest in digests)
     if unknown:
         raise InvalidSampleError.at(FRAME_DIGESTS, UNKNOWN_FRAMES, f"{unknown} others")
@@ -232,7 +232,7 @@ def _named(digests: Sequence[bytes], known: Known) -> tuple[NamedFrame, ...]:
 
 
 def _positions(row: Row, lengths: Sequence[int]) -> list[npt.NDArray[Any]]:
-    """The frame positions of the first and the second trajectory of one sample, without padding.
+    """Return one sample's frame positions for the first and the second trajectory, without padding.
 
     Both lie in one array, unless there are second frames.
     """
@@ -244,7 +244,7 @@ def _positions(row: Row, lengths: Sequence[int]) -> list[npt.NDArray[Any]]:
 
 
 def _unpadded(row: Row, name: str, total: int) -> npt.NDArray[Any]:
-    """Positions up to ``total``. The rest must be zero padding, or num_frames is wrong."""
+    """Return positions up to ``total``. The rest must be zero padding, or num_frames is wrong."""
     positions = row[name]
     if total > len(positions):
         raise InvalidSampleError.at(NUM_FRAMES, f"at most the {len(positions)} frames in {name}", str(total))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Names of models and requests; names, types and dimensions of the tensors; the digest of a frame.
+"""Model and request names; tensor names, types and dimensions; frame digests.
 
 Letters as in the package.
 """
@@ -19,11 +19,11 @@ import numpy.typing as npt
 from rfm_client.contract.results import FRAME_SCORES
 from rfm_client.contract.samples import UInt8Array
 
-Part: TypeAlias = Literal["embeddings", "encoder", "frames"]  # models of a served checkpoint
+Part: TypeAlias = Literal["embeddings", "encoder", "frames"]  # models in a served checkpoint
 
-DEFAULT_MODEL = "rfm"  # scores embeddings; the names of the other models derive from it
+DEFAULT_MODEL = "rfm"  # scores embeddings; the other models derive their names from it
 
-PROBE_PREFIX = "rfm-probe"  # of the request ids of probes, which a model's metrics leave out
+PROBE_PREFIX = "rfm-probe"  # begins probes' request ids, which a model's metrics ignore
 
 ADMIN_KEY_VARIABLE = "RFM_ADMIN_KEY"
 
@@ -59,11 +59,11 @@ SIMILARITY = "similarity"
 PROGRESS_LOGITS = "progress_logits"
 TIMING_MS = "timing_ms"
 
-REQUEST_ID = re.compile(r"[\w.:/+=@-]{1,64}", re.ASCII)  # ids that a request may have
+REQUEST_ID = re.compile(r"[\w.:/+=@-]{1,64}", re.ASCII)  # valid request ids
 
 UNKNOWN_FRAMES = "digests of frames that this model knows or has been sent"  # expected by the error for unknown digests
 
-DIGEST_BYTES = 32  # of SHA-256: nobody can make two frames with one digest
+DIGEST_BYTES = 32  # SHA-256: nobody can make two frames with one digest
 
 VARIABLE = -1  # a dimension that differs between requests
 
@@ -106,7 +106,7 @@ _DIGESTS_SPEC = TensorSpec(FRAME_DIGESTS, "UINT8", (VARIABLE, DIGEST_BYTES), rag
 
 
 def frame_digest(frame: UInt8Array) -> bytes:
-    """Return the SHA-256 of a frame, uint8 [H, W, 3]: of H and W (4 bytes each, little-endian), then the pixels."""
+    """Return the SHA-256 of a frame, uint8 [H, W, 3]: of H and W (4 bytes each, little-endian), then of the pixels."""
     digest = hashlib.sha256(np.array(frame.shape[:2], "<u4").tobytes())
     digest.update(np.ascontiguousarray(frame).data)
     return digest.digest()
@@ -121,19 +121,19 @@ def embedding_inputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
 def frame_inputs(*, by_digest: bool = False, with_views: bool = False) -> tuple[TensorSpec, ...]:
     """Return the inputs of a model that scores raw frames.
 
-    by_digest: with the digests of frames
-    with_views: with the frames of further cameras, and a goal
+    by_digest: with frame digests
+    with_views: with further cameras' frames, and a goal
     """
     return (*_QUESTION_SPECS, *_FRAMES_SPECS, *_VIEWS_SPECS * with_views, *[_DIGESTS_SPEC] * by_digest)
 
 
 def encoder_inputs(*, by_digest: bool = False) -> tuple[TensorSpec, ...]:
-    """Return the inputs of the encoder; num_frames excludes padding. ``by_digest`` as in ``frame_inputs``."""
+    """Return the encoder's inputs; num_frames excludes padding. ``by_digest`` as in ``frame_inputs``."""
     return (_NUM_FRAMES_SPEC, *_FRAMES_SPECS, *([_DIGESTS_SPEC] if by_digest else []))
 
 
 def encoder_outputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
-    """Return the outputs of the encoder: the embeddings among ``embedding_inputs``."""
+    """Return the encoder's outputs: the embeddings among ``embedding_inputs``."""
     return tuple(
         TensorSpec(spec.name, spec.datatype, spec.dims)
         for spec in embedding_inputs(video_dim, text_dim)
@@ -142,10 +142,10 @@ def encoder_outputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
 
 
 def score_outputs(progress_bins: int | None, more: Collection[str] = ()) -> tuple[TensorSpec, ...]:
-    """Return the outputs of a reward model.
+    """Return a reward model's outputs.
 
     progress_bins: K of a discrete checkpoint; None: continuous
-    more: scores of frames that the model gives beside those of every model, and of progress bins
+    more: frame scores beyond those that every model gives and those for progress bins
     """
     of_every_model = [name for name, score in FRAME_SCORES.items() if score.asked == "always"]
     of_bins = [name for name, score in FRAME_SCORES.items() if score.is_per_bin and progress_bins is not None]
@@ -160,7 +160,7 @@ def score_outputs(progress_bins: int | None, more: Collection[str] = ()) -> tupl
 
 
 def num_positions(inputs: Mapping[str, npt.NDArray[Any]]) -> int:
-    """Return P, the number of frame positions of one request, over all its arrays."""
+    """Return P, the number of frame positions in one request, over all its arrays."""
     if FRAME_DIGESTS in inputs:
         return int(inputs[FRAME_DIGESTS].shape[1])
     return sum(int(inputs[name].shape[1]) for name in (FRAMES, SECOND_FRAMES, VIDEO_EMBEDDINGS) if name in inputs)
@@ -171,7 +171,7 @@ def pad_stack(
 ) -> npt.NDArray[Any]:
     """Return [B, length, ...] from B rows; a row joins arrays [N, ...] of one dtype and is padded with ``fill``.
 
-    length: None: the length of the longest row
+    length: None: the longest row's length
     """
     if length is None:
         length = max(sum(map(len, parts)) for parts in rows)
