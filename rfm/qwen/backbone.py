@@ -355,7 +355,7 @@ class Part:
         self._options = {} if key_values is None else {cache: key_values}
 
     def run(self, number: int, layer: Any) -> None:
-        """Run layer ``number``."""
+        """Run layer ``number`` on the tokens."""
         states = layer(self.states, position_embeddings=self._turned, attention_mask=self._mask(), **self._options)
         self.states = states[0] if isinstance(states, tuple) else states  # transformers 4.57 with Qwen2.5-VL
         if number < len(self._deeper):

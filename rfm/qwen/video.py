@@ -81,7 +81,7 @@ class VlmVideo:
 
     @cached_property
     def digests(self) -> Sequence[bytes]:
-        """The frames' digests."""
+        """The digests by frame, from the server if the frames are named."""
         return self.named or digests_of(list(self.frames), IN_TURN)
 
     def compute_digests(self, threads: FrameThreads) -> None:

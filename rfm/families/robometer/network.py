@@ -25,14 +25,14 @@ Pooling: TypeAlias = Literal["mean", "boundary", "attention"]
 class VlmConfig(BackboneConfig):
     """The configuration of a checkpoint's network and prompts.
 
-    multi_image: each frame is an image; otherwise a trajectory is a video
-    per_frame_progress_token: an image's state is that of a progress token behind it
+    multi_image: each frame is an image; else a trajectory is a video
+    per_frame_progress_token: the state of an image is that of a progress token behind it
     frame_pooling: pools an image's tokens to its state, without progress tokens; boundary: takes the last token
-    pooling_temperature: temperature for attention pooling
-    average_temporal_patches: in video mode, average a temporal patch's tokens; otherwise read the token behind them
-    progress_in_preference: preference prompts also ask for progress
+    pooling_temperature: temperature of attention pooling
+    average_temporal_patches: in video mode, a temporal patch's tokens are averaged; else the token behind them is read
+    progress_in_preference: prompts for preference also ask for progress
     size_px: for videos: height and width to which every frame is resized first; null: each frame keeps its own
-    trained_frames: most frames per trajectory in training, also the clients' default; None: unknown
+    trained_frames: most frames of a trajectory in training, by default also of clients; None: unknown
     """
 
     multi_image: bool
