@@ -56,6 +56,7 @@ class Execution:
         """Return the output of ``forward`` for each row.
 
         If the rows do not fit in memory, each half is tried. A row that does not fit alone gets an error.
+
         rows: a sequence, or a tensor with the rows along its first axis
         divided: handles a row too large to fit alone; None: the row cannot be divided
         """

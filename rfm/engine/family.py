@@ -97,7 +97,7 @@ class Checkpoint(Protocol):
     ) -> Predictor[Any, Any]:
         """Return a predictor with the checkpoint's network on ``device``. Raises CheckpointError.
 
-        dtype: for the network; None: as checkpoint and device decide
+        dtype: network dtype; None: as checkpoint and device decide
         cache: frame feature cache, if ``Description.keeps_features``; None: no cache
         """
 

@@ -32,6 +32,7 @@ class FeatureCache(Generic[Kept]):
     """Arrays by key, thread-safe. The least recently used arrays are removed first.
 
     limit_bytes: total size limit, with a fixed overhead per array
+
     Compute a key's digest here, from the array's source: a caller's digest could name other content.
     """
 

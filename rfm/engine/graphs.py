@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """CUDA graphs: a repeated call with equal tensor shapes becomes one launch instead of thousands.
 
-In a pass over a few samples, the host takes longer to launch the kernels than the device takes to run them. Tests
-replace ``CudaCapture``. Without a GPU, a "replay" that calls the function on the held inputs shows what a replay can
-get wrong: inputs that were not copied, outputs that another replay overwrites, values that the host has read.
+In a pass over a few samples, the host takes longer to launch the kernels than the device takes to run them.
+
+Tests replace ``CudaCapture``. Without a GPU, a "replay" that calls the function on the held inputs shows what a replay
+can get wrong: inputs that were not copied, outputs that another replay overwrites, values that the host has read.
 """
 
 from __future__ import annotations
@@ -96,6 +97,7 @@ class Graphs:
 
     capture: captures a call
     max_graphs: how many graphs are kept
+
     After a capture has failed, all calls are plain.
     """
 

@@ -166,8 +166,9 @@ def keep_float32() -> None:
     """Make GPUs and CPUs compute float32 in full precision; to be called before any computation.
 
     GPU: by default cuDNN rounds convolution inputs to TF32 (10 of 23 mantissa bits), which changes scores by more than
-    1e-5. CPU: MKL 2024.2 selects a function's code at its first call. If threads make that call at once, one may use
-    less exact code: a cosine is off by 1.5e-4 (pytorch/pytorch#188792). Here a single thread makes the first calls.
+    1e-5.
+    CPU: MKL 2024.2 selects a function's code at its first call. If threads make that call at once, one may use less
+    exact code: a cosine is off by 1.5e-4 (pytorch/pytorch#188792). Here a single thread makes the first calls.
     """
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cuda.matmul.allow_tf32 = False

@@ -108,7 +108,8 @@ def _tie(weights: dict[str, Tensor], config: Mapping[str, Any], file: Path) -> t
     """Drop a head that equals the embedding to which config.json ties it; return the head if it is assumed.
 
     transformers 4 (seen: 4.57.6) obeys text_config, and replaces a stored head; transformers 5 (seen: 5.23.0) obeys the
-    outer setting, and keeps a stored head. Raises CheckpointError for a head that only one of them uses.
+    outer setting, and keeps a stored head.
+    Raises CheckpointError for a head that only one of them uses.
     """
     outer, text = (part.get(_TIED) is True for part in (config, config["text_config"]))
     head, embedding = weights.get(HEAD), weights.get(EMBEDDING)
@@ -177,7 +178,7 @@ def is_ours(name: str, backbones: Collection[str], folder: Path) -> bool:
     """True if the folder holds an export of reward model ``name``, or a Qwen-VL so named without a run file.
 
     name: lower case; the folder's name, or that of the Hub repository it was copied from, may have hyphens
-    backbones: the model's, by model_type
+    backbones: known backbones, by model_type
     """
     if (exported := reward_model_of(folder)) is not None:
         return exported == name

@@ -137,7 +137,7 @@ _NO_EMBEDDING = (
 # In the names of embedding LoRA factors, and of an embedding that PEFT saves in two ways at once.
 _OTHER = re.compile(r"\.(lora_embedding_[AB]|modules_to_save|original_module)(\.|$)")
 _BASE_NAMES = ((r"^language_model\.", "model.language_model."), *QWEN_NAMES)  # the first: saved without a head
-_PARTS = ("model.language_model.", "model.visual.")  # in names in an adapter that wraps all parts
+_PARTS = ("model.language_model.", "model.visual.")  # prefixes if the adapter wraps the whole model
 
 
 def has_adapter(folder: Path) -> bool:
@@ -218,7 +218,7 @@ def check_factors(
 
     file: states ``config``, the adapter's configuration
     present: modules with factors
-    weights: the whole network's
+    weights: weights of the whole network
     root: prefix for the modules that PEFT wrapped
     """
     check_none_lost(file, _targeted(file, config, present, weights, root) - present)

@@ -134,7 +134,8 @@ class RunConfig:
     def size_px(self, multi_image: bool) -> tuple[int, int] | None:
         """Return height and width to which every frame is resized first; None: resizing starts from each frame's size.
 
-        None for images, for which all upstream versions with a frame_pool_attn ignore the keys. Raises CheckpointError.
+        None for images, for which all upstream versions with a frame_pool_attn ignore the keys.
+        Raises CheckpointError.
         """
         if multi_image:
             return None

@@ -64,7 +64,7 @@ def round_layers(
     """Return the weights with rounded layers, and the LoRA factors for the others.
 
     factors: LoRA factors, which are added before rounding
-    dtype: for decoded values
+    dtype: type of decoded values
     """
     whole: dict[str, Tensor] = {}
     rest = dict(factors)

@@ -129,7 +129,7 @@ def _read_shards(index: Path) -> dict[str, Tensor]:
 def _unwrapped(weights: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
     """Remove the prefixes from DataParallel, torch.compile, PEFT and FSDP, and any prefix that all names share.
 
-    folder: the checkpoint's, for messages
+    folder: checkpoint folder, for messages
     Raises CheckpointError if only some names have the prefix, or two names would be equal.
     """
     bare: dict[str, Tensor] = {}

@@ -5,8 +5,8 @@ The host computes all positions and indices beforehand and never waits for the d
 Results and summation order match ``transformers`` 4.57.
 
 Language model: B conversations, L tokens, width D, M visual tokens in total. A token has three coordinates: time, row
-and column. From one text token to the next, all three grow by 1. An image or video is a box whose tokens are numbered
-by their place inside it. The text behind a box continues after the box's largest coordinate. Padding follows the
+and column. From one text token to the next, all three grow by 1. An image or video is a box, and a token's coordinates
+are its place in that box. The text behind a box continues after the box's largest coordinate. Padding follows the
 tokens, where causal attention cannot see it. This avoids a mask, which PyTorch's fastest attention does not accept.
 
 Vision tower: a shot is a temporal patch, that is, an image or two video frames. Attention stays within a shot. There

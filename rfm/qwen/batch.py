@@ -220,7 +220,7 @@ class VlmBatch:
     """Conversations, padded to the longest, with F frames (or temporal patches) and Q queries.
 
     inputs: the backbone's arguments by name
-    spans: int64 [F, 3], row, first token and token behind the last, whose states score a frame
+    spans: int64 [F, 3], per frame the row, the first token and the token behind the last whose states are read
     query_rows, query_tokens: int64 [Q], row and token of the queries
     num_tokens, num_span_tokens: tokens without padding; tokens in all spans
     pixels: source of the pixel arguments; None: these are in ``inputs``, or all shots are cached

@@ -86,7 +86,8 @@ class QwenCheckpoint:
     def flop(self, sample: Sample) -> float:
         """Return how many operations a sample's products with weights take: two per parameter and patch or token.
 
-        Leaves out attention products, about a tenth, and the heads. Raises CheckpointError, InvalidSampleError.
+        Leaves out attention products, about a tenth, and the heads.
+        Raises CheckpointError, InvalidSampleError.
         """
         collator, config = self.collator, self.config
         rows = collator.rows(sample)

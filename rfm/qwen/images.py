@@ -2,7 +2,8 @@
 """Turn raw frames into a vision-language backbone's pixels, with the same values as upstream's collator.
 
 T frames, H x W pixels (H' x W' after resizing), C = 3 channels, P: patch side in pixels. A merged token stands for
-MERGE x MERGE patches. The CPU resizes frames once, as uint8 (``..._to_size``). The device does the rest in float.
+MERGE x MERGE patches.
+The CPU resizes frames once, as uint8 (``..._to_size``). The device does the rest in float.
 Sources: the resizing rules in ``qwen-vl-utils`` 0.0.14, the patch order in ``transformers``' Qwen2-VL image processor.
 Neither torchvision nor this processor is needed.
 """

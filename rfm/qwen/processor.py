@@ -67,8 +67,8 @@ _CHANNELS = 3
 def read_preprocessor(processor: str | Path, file: str, key: str) -> dict[str, Any]:
     """Return the preprocessing from ``file`` and from ``key`` in transformers 5's file; videos fall back to images.
 
-    transformers 4.57 reads the former first, transformers 5 the latter. Raises OSError if neither exists,
-    CheckpointError if they disagree.
+    transformers 4.57 reads the former first, transformers 5 the latter.
+    Raises OSError if neither exists, CheckpointError if they disagree.
     """
     folder = local_copy(processor)
     nested, found = _optional(folder / PROCESSOR_CONFIG).get(key), _optional(folder / file)

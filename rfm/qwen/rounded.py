@@ -145,9 +145,9 @@ def fit(network: nn.Module, weights: Mapping[str, Tensor], factors: Mapping[str,
 def rounded(name: str, weight: Tensor, kind: Weights, dtype: torch.dtype) -> dict[str, Tensor]:
     """Return the tensors for a rounded weight by name.
 
-    name: the weight's, which ends in ``.weight``
+    name: weight name, which ends in ``.weight``
     weight: float32 [N, K]
-    dtype: for decoded values
+    dtype: type of decoded values
     """
     if kind == "nf4":
         return of_layer(name, *quantize(weight), dtype)
@@ -167,7 +167,7 @@ NF4_CODES = (
 
 
 def of_layer(name: str, codes: Tensor, scales: Tensor, dtype: torch.dtype) -> dict[str, Tensor]:
-    """Return a layer's tensors by name. name: the weight's; dtype: for decoded values."""
+    """Return a layer's tensors by name. name: weight name; dtype: type of decoded values."""
     path = name.removesuffix(".weight")
     return {name: codes, path + SCALE: scales, path + DECODED: torch.empty(0, dtype=dtype)}
 

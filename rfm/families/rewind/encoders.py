@@ -130,7 +130,7 @@ class Encoders:
     ) -> list[EncoderSample | RewardError]:
         """Return each sample with embeddings for its frames and task, or its error.
 
-        execution: receives the costs; tokens count images (without padding) and tasks
+        execution: receives the costs, with image tokens (no padding) and task tokens
         cache: embedding cache, which encodes equal frames and tasks once; None: no cache, and no named frames
         """
         execution = execution or Execution()

@@ -6,9 +6,9 @@ continuous progress).
 
 A row is the token sequence ``[text] [first trajectory] ([second trajectory] [query])``. The network learns frame order
 from the causal mask, from an embedding added to each trajectory's first frame and, in some checkpoints, from a progress
-token behind each frame. There is no other positional encoding. Rows are packed one after the other without padding, [N,
-D]. Only attention needs rows of equal length, [B, L, D]. Architecture: ReWiND (https://arxiv.org/abs/2505.10911) as in
-the public implementation ``reward_fm``.
+token behind each frame. There is no other positional encoding.
+Rows are packed one after the other without padding, [N, D]. Only attention needs rows of equal length, [B, L, D].
+Architecture: ReWiND (https://arxiv.org/abs/2505.10911) as in the public implementation ``reward_fm``.
 """
 
 from __future__ import annotations

@@ -185,9 +185,10 @@ def load_tokenizer(source: str | Path, vocab_size: int) -> Any:
 
 
 def load_model(source: str | Path, weights: Mapping[str, Tensor] | None, known: Sequence[str]) -> Any:
-    """Load the model from ``source``, with ``weights``, if given, instead of its own.
+    """Load the model from ``source``; ``weights``, if given, replace its own.
 
     transformers loads the weights, since it knows how their names changed between releases.
+
     known: accepted model types
     Raises OSError, CheckpointError, and ValueError for another type or for weights that do not fit exactly.
     """

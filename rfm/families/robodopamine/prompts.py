@@ -150,7 +150,7 @@ class RoboDopamineCollator(WritingCollator):
     def _questions(self, text: str, asked: Sequence[Images]) -> list[VlmRow]:
         """Return the rows for questions whose images have equal sizes and therefore equal tokens.
 
-        text: the chat template's
+        text: text from the chat template
         """
         grids = [self.grid(video) for video, _ in asked[0]]
         ids = expanded(self._chat.tokens(text), self.visual_pad, [grid.tokens_per_group for grid in grids])

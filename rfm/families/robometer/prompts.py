@@ -2,7 +2,8 @@
 """The exact prompts for vision-language checkpoints: scores depend on the wording.
 
 A question is a list of parts in reading order: text and whole trajectories. The chat template turns it into text, the
-tokenizer the text into tokens. Source: the collators in ``reward_fm`` and ``robometer``.
+tokenizer the text into tokens.
+Source: the collators in ``reward_fm`` and ``robometer``.
 """
 
 from __future__ import annotations
