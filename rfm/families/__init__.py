@@ -49,7 +49,7 @@ def encoders_of(package: str) -> type[FrameEncoders]:
 
 
 def load(folder: Path, *, family: str) -> Checkpoint:
-    """Load what ``Checkpoint.save`` wrote. Raises CheckpointError, also if weights are all NaN or zeros.
+    """Load what ``Checkpoint.save`` wrote. Raises CheckpointError, also for non-finite weights or zero matrices.
 
     family: package of the checkpoint's family
     The model.py in exports since 0.4 calls this function.

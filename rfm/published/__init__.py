@@ -67,7 +67,7 @@ def load(source: str | Path, **options: Any) -> Checkpoint:
 
 
 def read_from(folder: Path, family: Family, options: CheckpointConfig) -> Loaded:
-    """Read a checkpoint from a local folder. Raises CheckpointError, also if weights are all NaN or zeros."""
+    """Read a checkpoint from a local folder. Raises CheckpointError, also for non-finite weights or zero matrices."""
     loaded = reader_of(family).load(folder, options)
     check_used(options, loaded.checkpoint.config)
     for weights in loaded.checkpoint.parts.values():

@@ -74,7 +74,7 @@ def _num_bytes(text: str) -> int:
 
 SECONDS_PER_GROUP = 1  # upstream's value for videos of Qwen2.5-VL
 TOKENS_PER_SECOND = 4  # transformers' default for Qwen2.5-VL
-VIDEO_FPS = 1  # upstream's value for Qwen3-VL, whose prompt states when each temporal patch is shown
+VIDEO_FPS = 1  # upstream's value for Qwen3-VL, whose prompt states the time for each temporal patch
 VISION_START, VISION_END = "<|vision_start|>", "<|vision_end|>"
 IMAGE_PAD, VIDEO_PAD = "<|image_pad|>", "<|video_pad|>"
 

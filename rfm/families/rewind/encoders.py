@@ -2,8 +2,8 @@
 """Encode raw frames and tasks into the embeddings that a ReWiND transformer reads.
 
 A frame embedding is the pooled output of a DINOv2-type image encoder. A task embedding is the mean over all tokens in a
-BERT-type sentence encoder's last hidden state, not normalised. Both networks come from ``transformers``. T frames, H x
-W pixels, embedding widths Dv and Dt.
+BERT-type sentence encoder's last hidden state, not normalised. Both networks come from ``transformers``.
+T frames, H x W pixels, embedding widths Dv and Dt.
 """
 
 from __future__ import annotations

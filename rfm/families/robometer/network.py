@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Reward heads on a vision-language backbone from ``transformers``: RFM and Robometer checkpoints.
 
-F frames (in video mode: temporal patches) and Q queries in all rows, L tokens, width D, K progress bins. The heads read
-the last hidden states, behind the final norm: for a frame, pooled over a token span; for a query, at its token.
+F frames (in video mode: temporal patches) and Q queries in all rows, L tokens, width D, K progress bins.
+The heads read the last hidden states, behind the final norm: for a frame, pooled over a token span; for a query,
+at its token.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ _NUMBER = re.compile(r"[+-]?\d+(?:[.,/:-]\d+)*%?")
 class RoboRewardConfig(WritingConfig):
     """The configuration of RoboReward.
 
-    is_expected: no answer is written: its expected value over the five digits is the score
+    is_expected: no answer is written; the score is the expected value over the five digits
     strict_answers: an unclear answer is an error; otherwise its score is marked
     """
 

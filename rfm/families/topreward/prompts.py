@@ -38,7 +38,7 @@ PROMPT_SUFFIX = "{instruction} Decide whether the above statement is True or not
 ANSWER = "True"
 # Robometer's baseline: its processor assumes 24 frames per second for every video, and samples 2 per second.
 ASSUMED_FPS, SAMPLED_FPS, LEAST_SAMPLED = 24, 2, 4
-SIDES_PX = (224, 336, 320)  # successive frame sizes: from Pillow, qwen-vl-utils and the processor
+SIDES_PX = (224, 336, 320)  # successive frame sizes, after Pillow, qwen-vl-utils and the processor
 
 
 @dataclass(frozen=True)
