@@ -20,7 +20,7 @@ _CPU_OUT_OF_MEMORY = re.compile(  # PyTorch's allocator and oneDNN (which gives 
 
 @contextmanager
 def memory_errors() -> Iterator[None]:
-    """Turn errors for a lack of memory, from Python or from PyTorch on the CPU, into torch.OutOfMemoryError."""
+    """Turn out-of-memory errors, from Python or from PyTorch on the CPU, into torch.OutOfMemoryError."""
     try:
         yield
     except MemoryError as error:
@@ -37,9 +37,9 @@ def free_unused() -> None:
 
 
 def use(device: torch.device) -> None:
-    """Make ``device`` the current device of this thread.
+    """Make ``device`` the current device for this thread.
 
-    Call it in each computing thread: some kernels launch on the current device, wherever the tensors are.
+    Call this in each computing thread: some kernels launch on the current device, wherever the tensors are.
     """
     if device.type == "cuda":
         torch.cuda.set_device(device)
@@ -58,7 +58,7 @@ class Copies:
         self._stream = torch.cuda.Stream(device) if self.pins else None
 
     def send(self, pixels: Tensor) -> Tensor:
-        """Start to copy the pixels to the device, and return the copy; thread-safe."""
+        """Start copying the pixels to the device, and return the copy; thread-safe."""
         if self._stream is None:
             return pixels
         with torch.cuda.stream(self._stream):  # PyTorch keeps the pinned copy until this stream has read it

@@ -90,11 +90,11 @@ class Execution:
         self.forward_s += time.perf_counter() - started_s - (self.collate_s - collated_s)
 
     def add_tokens(self, num_tokens: int, num_slots: int) -> None:
-        """Count the tokens of one forward pass, without and with padding."""
+        """Count the tokens in one forward pass, without and with padding."""
         self.num_tokens += num_tokens
         self.num_slots += num_slots
 
     @property
     def padding_ratio(self) -> float:
-        """The share of padding among all token slots, 0 to 1; 0 if there was no forward pass."""
+        """The padding share among all token slots, 0 to 1; 0 if there was no forward pass."""
         return 1 - self.num_tokens / self.num_slots if self.num_slots else 0.0

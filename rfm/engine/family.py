@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The interface of a family of checkpoints to the engine and the export. A family is a package with a ``FAMILY``."""
+"""The interface between a checkpoint family and the engine and export. A family is a package with a ``FAMILY``."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     from rfm.engine.predictor import Predictor
 
 
-NETWORK = "network"  # key in Checkpoint.parts: the weights of the network that scores
-# Fields of networks' configurations that are newer than some exports, with the value of those exports.
+NETWORK = "network"  # key in Checkpoint.parts: weights for the network that scores
+# Network configuration fields that are newer than some exports, with the values that those exports had.
 _USUAL = {"has_preference": True, "has_success": True, "video_prompt": "bare", "strict_answers": False, "weights": None}
 
 
 def config_fields(config: Any) -> dict[str, Any]:
     """Return the fields of a network's configuration, as in files and digests.
 
-    Newer fields are left out if they have the value of older exports, so that older files and digests stay valid.
+    Newer fields are left out if they have the value from older exports, so that older files and digests stay valid.
     """
     return {name: value for name, value in asdict(config).items() if name not in _USUAL or value != _USUAL[name]}
 
@@ -43,11 +43,11 @@ class FrameEncoders(Protocol):
 
     @classmethod
     def describe(cls, folder: Path) -> Description:
-        """Return the description of the encoders that ``save`` wrote into ``folder``, without loading them."""
+        """Describe the encoders that ``save`` wrote into ``folder``, without loading them."""
 
     @property
     def description(self) -> Description:
-        """Network and frame size of these encoders."""
+        """The encoders' network and frame size."""
 
     def save(self, folder: Path) -> None:
         """Write the encoders into a folder, which may exist; ``load`` then needs no internet."""
@@ -61,10 +61,10 @@ class FrameEncoders(Protocol):
         execution: Execution,
         cache: FeatureCache[Float32Array] | None,
     ) -> list[EncoderSample | RewardError]:
-        """Return each sample with embeddings of its frames and task, or its error.
+        """Return each sample with embeddings for its frames and task, or its error.
 
-        execution: the costs are added to it
-        cache: of embeddings; None: no cache, and no samples with named frames
+        execution: receives the costs
+        cache: embedding cache; None: no cache, and no samples with named frames
         """
 
 
@@ -87,7 +87,7 @@ class Checkpoint(Protocol):
         """Return the network without weights, on PyTorch's device ``meta``."""
 
     def flop(self, sample: Sample) -> float:
-        """Return the floating-point operations to score a sample: about two for each parameter that a token passes.
+        """Return the floating-point operations for scoring a sample: about two per parameter that a token passes.
 
         Raises CheckpointError, and InvalidSampleError if this checkpoint cannot score the sample.
         """
@@ -97,22 +97,22 @@ class Checkpoint(Protocol):
     ) -> Predictor[Any, Any]:
         """Return a predictor with the checkpoint's network on ``device``. Raises CheckpointError.
 
-        dtype: of the network; None: as checkpoint and device decide
-        cache: for features of frames, if ``Description.keeps_features``; None: no cache
+        dtype: network dtype; None: as checkpoint and device decide
+        cache: frame feature cache, if ``Description.keeps_features``; None: no cache
         """
 
     def save(self, folder: Path) -> None:
-        """Write all but the encoders into a new folder, which ``Family.restore`` reads."""
+        """Write everything except the encoders into a new folder, which ``Family.restore`` reads."""
 
 
 @dataclass(frozen=True)
 class Family:
-    """A family of checkpoints, as it is served.
+    """A checkpoint family, as it is served.
 
     name: the package with this object as its ``FAMILY``
     restore: loads what ``Checkpoint.save`` wrote into a folder; raises CheckpointError
     reader: the module whose ``READER`` reads checkpoints as they were published, which serving never imports
-    encoders: the class of the family's encoders; None: its checkpoints score raw frames
+    encoders: the family's encoder class; None: its checkpoints score raw frames
     """
 
     name: str

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A bounded cache for features of frames and tasks, by digest."""
+"""A bounded cache for frame and task features, by digest."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rfm_client.contract.samples import Float32Array, UInt8Array
 from rfm_client.contract.wire import frame_digest
 
 BYTES_PER_MIB = 2**20
-_ENTRY_BYTES = 256  # of a key, the array's header and the entry in the ordered dict
+_ENTRY_BYTES = 256  # key, array header and ordered dict entry
 
 
 Source = TypeVar("Source")
@@ -31,9 +31,9 @@ class _Array(Protocol):  # a NumPy array, or a tensor on any device
 class FeatureCache(Generic[Kept]):
     """Arrays by key, thread-safe. The least recently used arrays are removed first.
 
-    limit_bytes: total size limit, with a fixed overhead for each array
+    limit_bytes: total size limit, with a fixed overhead per array
 
-    Compute the digest in a key here, from the array's source: a caller's digest could name other content.
+    Compute a key's digest here, from the array's source: a caller's digest could name other content.
     """
 
     def __init__(self, limit_bytes: int) -> None:
@@ -75,7 +75,7 @@ class FeatureCache(Generic[Kept]):
 
 
 def digests_of(frames: Sequence[UInt8Array], threads: FrameThreads) -> list[bytes]:
-    """Return the digest of each frame, uint8 [H, W, 3], computed in these threads."""
+    """Return the frames' digests, uint8 [H, W, 3], computed in these threads."""
     parts = threads.parts(lambda part: [frame_digest(frame) for frame in part], frames)
     return [digest for part in parts for digest in part]
 

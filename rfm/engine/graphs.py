@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""CUDA graphs: a repeated call with tensors of the same shapes becomes one launch instead of thousands.
+"""CUDA graphs: a repeated call with equal tensor shapes becomes one launch instead of thousands.
 
 In a pass over a few samples, the host takes longer to launch the kernels than the device takes to run them.
 
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 MAX_GRAPHS = 8  # each holds 10 to 20 MB for a 4B network, and its inputs and output
-PLAIN_CALLS = 2  # of a shape before its capture: they initialise libraries, and rare shapes need no graph
+PLAIN_CALLS = 2  # per shape before its capture: they initialise libraries, and rare shapes need no graph
 MAX_TOKENS = 2_560  # more keep the device busy for longer than the host launches
 STEP_TOKENS = 64
 IDLE_CALLS = 256  # a graph unused for this many calls makes room for another
@@ -85,7 +85,7 @@ class CudaCapture:
                 with torch.cuda.graph(graph, pool=pool, stream=self._stream, capture_error_mode="thread_local"):
                     output = function(*inputs)
             except RuntimeError:
-                # PyTorch leaves its allocator in the state of a capture, in which empty_cache() fails.
+                # PyTorch leaves its allocator in the capture state, in which empty_cache() fails.
                 with suppress(RuntimeError):
                     torch._C._cuda_endAllocateToPool(self._stream.device.index, pool)
                 raise
@@ -93,10 +93,10 @@ class CudaCapture:
 
 
 class Graphs:
-    """Calls functions of tensors; from the third call with the same shapes, as a CUDA graph. For one thread.
+    """Calls tensor functions; from the third call with the same shapes, as a CUDA graph. For one thread.
 
     capture: captures a call
-    max_graphs: number of graphs that are kept
+    max_graphs: how many graphs are kept
 
     After a capture has failed, all calls are plain.
     """
@@ -112,7 +112,7 @@ class Graphs:
     def __call__(self, function: Function, tensors: Sequence[Tensor], constants: Hashable, num_tokens: int) -> Tensor:
         """Return ``function(*tensors)``.
 
-        constants: all that the result depends on besides the tensors
+        constants: everything besides the tensors that determines the result
         num_tokens: a call with more than MAX_TOKENS is plain
         """
         if self.has_failed or num_tokens > MAX_TOKENS:
@@ -127,7 +127,7 @@ class Graphs:
         return captured(tensors)
 
     def padded(self, num_rows: int, length: int) -> int:
-        """Return the padded length for rows of ``length`` tokens, so other lengths share a graph.
+        """Return the padded length for rows with ``length`` tokens, so other lengths share a graph.
 
         A batch too large for a graph is not padded.
         """

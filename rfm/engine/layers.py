@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Layers shared by several families, the normalisation of pixels, and the precision of computation."""
+"""Layers shared by several families, pixel normalisation, and computation precision."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from rfm.files import MAX_UINT8
 
 Plan = TypeVar("Plan", bound=Any)
-WORTH_ONEDNN = 1 << 21  # multiplications; for fewer, the start of oneDNN costs more than it saves
+WORTH_ONEDNN = 1 << 21  # multiplications; for fewer, starting oneDNN costs more than it saves
 
 
 class Linear(nn.Linear):
@@ -51,7 +51,7 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, relu: bool = False
 
 
 class RmsNorm(nn.Module):
-    """The RMSNorm of transformers in two kernels instead of eight, with the same roundings.
+    """Transformers' RMSNorm in two kernels instead of eight, with the same roundings.
 
     The input is normalised in float32 and rounded to its dtype, then multiplied by the weight.
     """
@@ -68,8 +68,8 @@ class RmsNorm(nn.Module):
 def speed_up(network: nn.Module) -> None:
     """Replace layers by faster ones with the same parameters.
 
-    Every ``nn.Linear`` becomes a ``Linear``. On other devices than the CPU, ``RmsNorm`` replaces the RMSNorms of
-    transformers; on the CPU ``F.rms_norm`` is slower in bfloat16.
+    Every ``nn.Linear`` becomes a ``Linear``. On devices other than the CPU, ``RmsNorm`` replaces transformers'
+    RMSNorms; on the CPU ``F.rms_norm`` is slower in bfloat16.
     """
     for module in network.modules():
         for name, child in module.named_children():
@@ -83,7 +83,7 @@ def speed_up(network: nn.Module) -> None:
 
 
 def is_rms_norm(module: nn.Module) -> bool:
-    """True for an RMSNorm of transformers, which has one class for each backbone."""
+    """True for an RMSNorm from transformers, which has one class for each backbone."""
     return type(module).__name__.endswith("RMSNorm") and hasattr(module, "variance_epsilon")
 
 
@@ -165,8 +165,8 @@ MKL_FUNCTIONS = (
 def keep_float32() -> None:
     """Make GPUs and CPUs compute float32 in full precision; to be called before any computation.
 
-    GPU: by default cuDNN rounds inputs of convolutions to TF32 (10 of 23 mantissa bits), which changes scores by more
-    than 1e-5.
+    GPU: by default cuDNN rounds convolution inputs to TF32 (10 of 23 mantissa bits), which changes scores by more than
+    1e-5.
     CPU: MKL 2024.2 selects a function's code at its first call. If threads make that call at once, one may use less
     exact code: a cosine is off by 1.5e-4 (pytorch/pytorch#188792). Here a single thread makes the first calls.
     """
@@ -184,13 +184,13 @@ def _call_each_once() -> None:
 
 @dataclass(frozen=True)
 class Normalisation:
-    """Normalisation of each channel's pixels: (value - 255 mean) / (255 std)."""
+    """Normalise pixels per channel: (value - 255 mean) / (255 std)."""
 
     mean: tuple[float, ...]
     std: tuple[float, ...]
 
     def to_config(self) -> dict[str, Any]:
-        """Return the corresponding fields of preprocessor_config.json."""
+        """Return the corresponding fields for preprocessor_config.json."""
         return {"image_mean": self.mean, "image_std": self.std, "rescale_factor": 1 / MAX_UINT8}
 
     def __call__(self, frames: Tensor) -> Tensor:

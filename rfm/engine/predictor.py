@@ -36,28 +36,28 @@ class Predictor(Protocol[Row, Batch]):
 
     @property
     def has_progress(self) -> bool:
-        """False if the network does not predict progress, which is NaN then."""
+        """False if the network does not predict progress, which is then NaN."""
 
     @property
     def has_success(self) -> bool:
-        """False if the network does not predict success, which is NaN then."""
+        """False if the network does not predict success, which is then NaN."""
 
     @property
     def reads_views(self) -> bool:
-        """True if the network reads views of further cameras and a goal."""
+        """True if the network reads a goal and views from further cameras."""
 
     @property
     def works_ahead(self) -> bool:
         """True if ``work_ahead`` takes enough time to be worth a thread."""
 
     def rows(self, sample: Sample) -> list[Row]:
-        """Return the sample's rows, without a forward pass: one, or one for each prefix that is scored.
+        """Return the sample's rows, without a forward pass: one, or one per prefix to score.
 
         Raises InvalidSampleError if this checkpoint cannot score the sample.
         """
 
     def num_tokens(self, row: Row) -> int:
-        """Return the number of computed tokens. Rows with similar numbers share a batch."""
+        """Return how many tokens are computed. Rows with similar counts share a batch."""
 
     def sequences(self, row: Row) -> Sequence[Row]:
         """Return the row's token sequences, each as a row. Most rows have one."""
@@ -72,7 +72,7 @@ class Predictor(Protocol[Row, Batch]):
         """Add the batch's tokens, with and without padding, and its encoded frames to ``execution``."""
 
     def score(self, rows: Sequence[Row], batch: Batch, execution: Execution) -> list[RowScores | RewardError]:
-        """Run one forward pass; return each row's scores on the CPU, or its error.
+        """Run one forward pass; return the scores of each row on the CPU, or its error.
 
         execution: with several passes, call ``on_forward`` after each
         """
@@ -90,11 +90,11 @@ class GraphedPredictor(Predictor[Row, Batch], Protocol):
 
 @dataclass(frozen=True, eq=False)
 class RowScores:
-    """Scores of one row.
+    """Scores for one row.
 
     frames: scores for each trajectory
-    query: the preference or similarity of two trajectories; None: the row asks for neither
-    is_of_prefixes: the row has several prefixes (dense mode), with one value for the last frame of each
+    query: the preference or similarity between two trajectories; None: the row asks for neither
+    is_of_prefixes: the row has several prefixes (dense mode), with one value for each prefix's last frame
     """
 
     frames: list[FrameScores]
@@ -136,7 +136,7 @@ def of_rows(sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
 
 
 def of_prefixes(rows: Sequence[RowScores]) -> FrameScores:
-    """Return scores for the last frame of each prefix."""
+    """Return scores for the last frame in each prefix."""
     newest = slice(-1, None)
     return FrameScores.joined([row.frames[0] if row.is_of_prefixes else row.frames[0].at(newest) for row in rows])
 

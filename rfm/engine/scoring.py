@@ -100,8 +100,8 @@ class Engine:
     ) -> Engine:
         """Return the engine for a checkpoint in memory.
 
-        dtype: network dtype; None: a vision-language checkpoint's own on a GPU, else float32
-        feature_cache_mib: MiB for features of raw frames; 0: no cache
+        dtype: network dtype; None: a vision-language checkpoint's own on a GPU, otherwise float32
+        feature_cache_mib: MiB for features from raw frames; 0: no cache
         cuda_graphs: run small batches as CUDA graphs; no effect on the CPU or without ``Description.uses_graphs``
         others: as in the class
         Raises CheckpointError.
@@ -137,7 +137,7 @@ class Engine:
         return self._results(prepared, execution, before)
 
     def prepare(self, sample: Sample) -> Prepared:
-        """Make the rows of a sample, without encoders or a forward pass; may run while another thread scores.
+        """Make a sample's rows, without encoders or a forward pass; may run while another thread scores.
 
         sample: frames or embeddings as the network reads them; the encoders are not used
         """
@@ -154,7 +154,7 @@ class Engine:
             self.predictor.work_ahead(prepared.rows)
 
     def score(self, prepared: Sequence[Prepared], execution: Execution) -> list[Outcome]:
-        """Return the results of prepared samples, from forward passes."""
+        """Return the results for prepared samples, from forward passes."""
         return self._results(prepared, execution, replace(execution))
 
     def _embedded(self, samples: Sequence[Sample], execution: Execution) -> Sequence[Sample | RewardError]:
@@ -234,7 +234,7 @@ class Engine:
                 batch = coming.result() if coming is not None else None
 
     def _collate(self, rows: Sequence[Any]) -> Any:
-        """Return the batch of the rows; None if it does not fit in memory now."""
+        """Return the rows' batch; None if it does not fit in memory now."""
         try:
             with memory_errors():
                 return self.predictor.collate(rows)
@@ -285,14 +285,14 @@ class Engine:
             return ProgressResult(**vars(frames), timing=timing)
         first, second = rows[0].frames
         query = rows[0].query
-        assert query is not None  # every row of two trajectories has a query
+        assert query is not None  # every row with two trajectories has a query
         if isinstance(sample, PreferenceSample):
             return PreferenceResult(preference=query, first=first, second=second, timing=timing)
         return SimilarityResult(similarity=query, reference=first, other=second, timing=timing)
 
 
 def _of_sequences(outcomes: Sequence[RowScores | RewardError]) -> RowScores | RewardError:
-    """Join scores of sequences, which are prefixes, to those of a row, or return the first error."""
+    """Join the scores of sequences, which are prefixes, into row scores, or return the first error."""
     error = next((outcome for outcome in outcomes if isinstance(outcome, RewardError)), None)
     if error is not None:
         return error
@@ -300,12 +300,12 @@ def _of_sequences(outcomes: Sequence[RowScores | RewardError]) -> RowScores | Re
 
 
 def _finite(outcomes: Sequence[Result | RewardError], *, lacks: Collection[str]) -> list[Result | RewardError]:
-    """Return the outcomes, with an error in place of each result with a NaN or infinite score.
+    """Return the outcomes, where an error replaces any result with a NaN or infinite score.
 
     lacks: scores the network does not predict, which are NaN
 
-    Frames that the model does not answer about are not checked. Neither are logits of progress: RoboReward has none for
-    an answer without a digit, and progress shows the others' faults.
+    Frames that the model does not answer about are not checked. Neither are progress logits: RoboReward has none for an
+    answer without a digit, and progress shows other models' faults.
     """
     scores = [[] if isinstance(each, RewardError) else list(_scores(each, lacks)) for each in outcomes]
     of_all = [array for of_one in scores for array in of_one]

@@ -18,13 +18,13 @@ Made = TypeVar("Made")
 
 
 def use_threads(number: int) -> None:
-    """Set the number of PyTorch's threads for the calling thread."""
-    torch.get_num_threads()  # else the first use takes the number of another thread
+    """Set PyTorch's thread count for the calling thread."""
+    torch.get_num_threads()  # otherwise the first use takes another thread's count
     torch.set_num_threads(number)
 
 
 def num_preparing(device: torch.device, num_threads: int) -> int:
-    """Return how many of an instance's threads prepare frames while the network computes: all with a GPU, else 1."""
+    """Return how many instance threads prepare frames while the network computes: all with a GPU, otherwise 1."""
     return num_threads if device.type == "cuda" else 1
 
 
@@ -36,16 +36,16 @@ class FrameThreads:
 
     def __init__(self, number: int) -> None:
         self.number = number
-        # The work must not wait for these threads itself. They end with this object.
+        # Work must not itself wait for these threads. They end with this object.
         self._pool = ThreadPoolExecutor(number, "rfm-frames", partial(use_threads, 1)) if number > 1 else None
 
     @classmethod
     def of(cls, device: torch.device) -> FrameThreads:
-        """Return the threads for a network on ``device``, created in a thread with the instance's number of threads."""
+        """Return the threads for a network on ``device``, created in a thread that has the instance's thread count."""
         return cls(num_preparing(device, torch.get_num_threads()))
 
     def parts(self, work: Callable[[Sequence[Item]], Made], items: Sequence[Item]) -> list[Made]:
-        """Split items into one part for each thread; return the result of ``work`` for each part, in order."""
+        """Split items into one part per thread; return the results of ``work`` in order."""
         if self._pool is None or len(items) < 2:
             return [work(items)]
         size = -(-len(items) // self.number)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The families of checkpoints, as they are served.
+"""The checkpoint families, as they are served.
 
 Nothing here reads other people's files: that is ``rfm.published``.
 """
@@ -22,7 +22,7 @@ FAMILIES = (
     "rfm.families.robometer",
     "rfm.families.rewind",
 )
-# Names of packages in exports of 0.4.
+# Package names in exports from 0.4.
 _FORMER = {f"rfm.{name.rpartition('.')[2]}": name for name in FAMILIES} | {"rfm.vlm": "rfm.families.robometer"}
 
 
@@ -41,7 +41,7 @@ def named(package: str) -> Family:
 
 
 def encoders_of(package: str) -> type[FrameEncoders]:
-    """Return the class of a family's encoders. Raises CheckpointError if the family has none."""
+    """Return a family's encoder class. Raises CheckpointError if the family has none."""
     encoders = named(package).encoders
     if encoders is None:
         raise CheckpointError.at("family", "one with encoders", f"{package}, whose checkpoints score raw frames")
@@ -49,10 +49,10 @@ def encoders_of(package: str) -> type[FrameEncoders]:
 
 
 def load(folder: Path, *, family: str) -> Checkpoint:
-    """Load what ``Checkpoint.save`` wrote. Raises CheckpointError, also for weights of NaN or zeros.
+    """Load what ``Checkpoint.save`` wrote. Raises CheckpointError, also for non-finite weights or zero matrices.
 
     family: package of the checkpoint's family
-    The model.py of exports since 0.4 calls this.
+    The model.py in exports since 0.4 calls this function.
     """
     checkpoint = named(family).restore(folder)
     for weights in checkpoint.parts.values():

@@ -2,9 +2,9 @@
 """Read checkpoints as others published them, or as they were exported: at export and in tools, never in serving.
 
 A checkpoint is a local folder or a Hugging Face id ``org/name[/subfolder][@tag]``. It holds ``model.safetensors`` (or
-shards with an index, or an adapter) and ``config.json`` (the network). ``config.yaml`` (the training run) is there,
-in the parent folder, or on main of the Hub's repository. Nothing in a checkpoint is executed: weights are read from
-safetensors alone, and YAML tags construct no objects.
+shards with an index, or an adapter) and ``config.json`` (the network). ``config.yaml`` (the training run) is there, in
+the parent folder, or on main in the Hub repository. Nothing in a checkpoint is executed: weights are read only from
+safetensors, and YAML tags construct no objects.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from rfm.weights import check_values
 
 
 def reader_of(family: Family) -> Reader:
-    """Return the family's reader of published checkpoints."""
+    """Return the family's reader for published checkpoints."""
     reader = import_module(family.reader).READER
     assert isinstance(reader, Reader), family.reader
     return reader
 
 
 def choose(folder: Path, package: str | None = None, options: CheckpointConfig | None = None) -> Family:
-    """Return the family ``package``, or of the reward model in ``options``, else the first that reads the folder.
+    """Return the family ``package``, or that of the reward model in ``options``, or the first that reads the folder.
 
     Raises CheckpointError.
     """
@@ -47,14 +47,14 @@ def choose(folder: Path, package: str | None = None, options: CheckpointConfig |
             return found
         names = [name for reader in readers.values() for name in reader.reward_models]
         raise CheckpointError.at("--as", f"one of {', '.join(names)}", repr(wanted))
-    *_, last = readers  # whose load explains the fault
+    *_, last = readers  # its load explains the fault
     return next((family for family, reader in readers.items() if reader.reads(folder)), last)
 
 
 def read(source: str | Path, *, family: str | None = None, **options: Any) -> Loaded:
-    """Read the checkpoint of a local folder or Hugging Face id. Raises CheckpointError.
+    """Read a checkpoint from a local folder or Hugging Face id. Raises CheckpointError.
 
-    family: package of its family; None: the family that reads the folder's files
+    family: the family's package; None: the family that reads the folder's files
     options: fields of ``CheckpointConfig``
     """
     folder, settings = find(source), CheckpointConfig(**options)
@@ -62,12 +62,12 @@ def read(source: str | Path, *, family: str | None = None, **options: Any) -> Lo
 
 
 def load(source: str | Path, **options: Any) -> Checkpoint:
-    """Load the checkpoint of a local folder or Hugging Face id. options: as of ``read``. Raises CheckpointError."""
+    """Load a checkpoint from a local folder or Hugging Face id. options: as for ``read``. Raises CheckpointError."""
     return read(source, **options).checkpoint
 
 
 def read_from(folder: Path, family: Family, options: CheckpointConfig) -> Loaded:
-    """Read the checkpoint of a local folder. Raises CheckpointError, also for weights of NaN or zeros."""
+    """Read a checkpoint from a local folder. Raises CheckpointError, also for non-finite weights or zero matrices."""
     loaded = reader_of(family).load(folder, options)
     check_used(options, loaded.checkpoint.config)
     for weights in loaded.checkpoint.parts.values():
@@ -76,14 +76,14 @@ def read_from(folder: Path, family: Family, options: CheckpointConfig) -> Loaded
 
 
 def notes(folder: Path, loaded: Loaded, answered: Collection[str] = HEADS) -> list[str]:
-    """Return a line for the user about each doubtful setting or head that the checkpoint's scores depend on.
+    """Return one line for the user per doubtful setting or head that the checkpoint's scores depend on.
 
-    answered: heads that the model serves; of a missing head, only its absence is noted
+    answered: heads that the model serves; for a missing head, only its absence is noted
     Raises CheckpointError for a config.yaml that cannot be read.
     """
     description = loaded.checkpoint.description
     heads = [head for head in answered if head not in description.lacks]
-    expected = set() if description.asks_in_words else {*answered} - {SIMILARITY}  # which most lack
+    expected = set() if description.asks_in_words else {*answered} - {SIMILARITY}  # most networks lack SIMILARITY
     missing = [head for head in answered if head in expected and head in description.lacks]
     without = [f"{WEIGHTS}: there is no head of {' and '.join(missing)}: served without"] if missing else []
     of_weights = constant_heads(loaded.checkpoint.parts[NETWORK], heads)

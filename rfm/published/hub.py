@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Find a checkpoint: in a local folder, or in a repository of the Hugging Face Hub."""
+"""Find a checkpoint: in a local folder, or in a Hugging Face Hub repository."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _BEST_TAG = re.compile(r"best-.*?-(-?\d+\.\d+)-step-\d+")
 
 
 def find(source: str | Path, say: Callable[[str], object] = _log.warning) -> Path:
-    """Return the local folder of a checkpoint, fetched from the Hub if necessary. Raises CheckpointError.
+    """Return a checkpoint's local folder, fetched from the Hub if necessary. Raises CheckpointError.
 
-    An existing folder wins over a Hub id of the same name.
-    say: takes a line about a revision from the Hub's cache while the Hub cannot be reached
+    An existing folder wins over a Hub id with the same name.
+    say: receives a line about the cached revision in use if the Hub cannot be reached
     """
     try:
         path = Path(source).expanduser()
@@ -46,7 +46,7 @@ def find(source: str | Path, say: Callable[[str], object] = _log.warning) -> Pat
 def check_links(folder: Path) -> None:
     """Raise CheckpointError for a link out of ``folder``, in it or one level below.
 
-    Links of the Hub's cache, from ``snapshots/<commit>`` to ``blobs``, are allowed.
+    Links inside the Hub's cache, from ``snapshots/<commit>`` to ``blobs``, are allowed.
     """
     home = folder.resolve()
     snapshot = snapshot_of(home)
@@ -57,12 +57,12 @@ def check_links(folder: Path) -> None:
 
 
 def commit_of(folder: Path) -> str:
-    """Return the commit of a checkpoint in the Hub's cache (its snapshot's name), else the folder's name."""
+    """Return a checkpoint's commit in the Hub's cache (its snapshot's name), otherwise the folder's name."""
     return (snapshot_of(folder) or folder).name
 
 
 def best_tag(tags: Iterable[str]) -> str | None:
-    """Return the tag ``best-<metric>-<score>-step-<n>`` with the highest score, the first of equals; else None."""
+    """Return the tag ``best-<metric>-<score>-step-<n>`` with the highest score (the first if tied), otherwise None."""
     scores = {tag: float(match[1]) for tag in tags if (match := _BEST_TAG.search(tag))}
     return max(scores, key=scores.__getitem__, default=None)
 
@@ -91,7 +91,7 @@ def _best_revision(repo_id: str) -> str | None:
 
 
 def _cached_revision(repo_id: str, down: str, say: Callable[[str], object]) -> str:
-    """Return the best revision with weights in the Hub's cache, and say which. Raises HubError if there is none."""
+    """Return the best revision with weights in the Hub's cache, and report it. Raises HubError if there is none."""
     snapshots = {name: folder for name, folder in _snapshots(repo_id).items() if any(folder.rglob(HUB_WEIGHTS))}
     revision = best_tag(snapshots) or ("main" if "main" in snapshots else None)
     if revision is None:
@@ -102,7 +102,7 @@ def _cached_revision(repo_id: str, down: str, say: Callable[[str], object]) -> s
 
 
 def _snapshot(repo_id: str, subfolder: str, tag: str | None, path: Path, *, is_down: bool) -> Path:
-    """Return the folder of a revision in the Hub's cache, with all files that are read. tag: None: main"""
+    """Return a revision's folder in the Hub's cache, with all files that are read. tag: None: main."""
     from huggingface_hub import snapshot_download
 
     patterns, run_configs = HUB_FILES, [RUN_CONFIG]
@@ -142,14 +142,14 @@ def _snapshots(repo_id: str) -> dict[str, Path]:
 
 
 def _cached(repo_id: str, subfolder: str) -> str:
-    """Name the revisions of a repository in the Hub's cache, which need no network."""
+    """Name a repository's revisions in the Hub's cache, which need no network."""
     within = f"/{subfolder}" if subfolder else ""
     names = [f"{repo_id}{within}@{name}" for name in _snapshots(repo_id)]
     return f"; without it, name a revision that is in the cache: {', '.join(names)}" if names else ""
 
 
 def _fetch_run_config_of_main(repo_id: str, names: Iterable[str], *, is_down: bool) -> None:
-    """Fetch the first existing of these files of main into the Hub's cache, where ``find_run_config`` looks."""
+    """Fetch the first of these files that exists on main into the Hub's cache, where ``find_run_config`` looks."""
     from huggingface_hub import _CACHED_NO_EXIST, hf_hub_download, try_to_load_from_cache
     from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
 

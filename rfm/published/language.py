@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read the files of a Qwen-VL with its language head, as Hugging Face has them."""
+"""Read a Qwen-VL with its language head from files in Hugging Face's format."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ Made = TypeVar("Made", bound=LanguageCheckpoint)
 
 @dataclass(frozen=True)
 class LanguageFolder:
-    """The files of a Qwen-VL.
+    """The files in a Qwen-VL's folder.
 
-    backbone: as ``BackboneConfig``'s
+    backbone: as in ``BackboneConfig``
     dtype: stated by config.json
     base_model: source of the tokenizer and processor
     video_prompt: form of the prompt
-    rounded: form of rounded layers; None: not rounded
+    rounded: number format for rounded layers; None: not rounded
     assumed: dtype, video_prompt and language_head, if no file proves them
     """
 
@@ -53,9 +53,9 @@ class LanguageFolder:
 
     @classmethod
     def read(cls, folder: Path, options: CheckpointConfig, backbones: Mapping[str, str] = ONLY_QWEN3) -> LanguageFolder:
-        """Read the folder. Raises CheckpointError if it is no Qwen-VL with a language head.
+        """Read the folder. Raises CheckpointError unless it holds a Qwen-VL with a language head.
 
-        backbones: names for the user of the networks that are read, by model_type
+        backbones: accepted networks: user-facing names by model_type
         """
         file = folder / NETWORK_CONFIG
         content = read_json(file)
@@ -93,12 +93,12 @@ class LanguageFolder:
         }
 
     def assumptions(self, config: LanguageConfig) -> tuple[Assumption, ...]:
-        """Return the settings that nothing proves and that have an effect."""
+        """Return the unproven settings that have an effect."""
         return tuple(each for each in self.assumed if not (config.multi_image and each.name == "video_prompt"))
 
 
 def reopened(made: type[Made], folder: Path, options: CheckpointConfig) -> Made:
-    """Load an export, with the processor and the form of weights that the user asks for. Raises CheckpointError."""
+    """Load an export, with the processor and weight format that the user asks for. Raises CheckpointError."""
     checkpoint = made.restore(folder)
     config, weights, _ = rounded_as_asked(checkpoint.config, checkpoint.weights, {}, options.weights)
     return replace(checkpoint, config=config, weights=weights, processor=options.base_model or checkpoint.processor)
@@ -135,7 +135,7 @@ def _tie(weights: dict[str, Tensor], config: Mapping[str, Any], file: Path) -> t
 
 
 def dtype_of(config: Mapping[str, Any], file: Path) -> tuple[Dtype, tuple[Assumption, ...]]:
-    """Return the number type of the network, and the type as an assumption if config.json states none.
+    """Return the network's number type, also as an assumption if config.json states none.
 
     Raises CheckpointError.
     """
@@ -149,7 +149,7 @@ def dtype_of(config: Mapping[str, Any], file: Path) -> tuple[Dtype, tuple[Assump
 
 
 GENERATION_CONFIG = "generation_config.json"
-# Keys of GENERATION_CONFIG without effect on the likeliest token.
+# GENERATION_CONFIG keys without effect on the likeliest token.
 _IDLE_KEYS = {
     "_from_model_config", "bos_token_id", "do_sample", "eos_token_id", "max_length", "max_new_tokens", "pad_token_id",
     "temperature", "top_k", "top_p", "transformers_version", "use_cache",
@@ -175,10 +175,10 @@ def stops_of(folder: Path) -> tuple[int, ...]:
 
 
 def is_ours(name: str, backbones: Collection[str], folder: Path) -> bool:
-    """True if the folder holds an export of the reward model ``name``, or a Qwen-VL of this name without a run's file.
+    """True if the folder holds an export of reward model ``name``, or a Qwen-VL so named without a run file.
 
-    name: lower case; the name of the folder, or of the Hub's repository that it is a copy of, may have hyphens
-    backbones: of the model, by model_type
+    name: lower case; the folder's name, or that of the Hub repository it was copied from, may have hyphens
+    backbones: known backbones, by model_type
     """
     if (exported := reward_model_of(folder)) is not None:
         return exported == name

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Adapters in PEFT's format, and the modules without factors in them, by PEFT's rules (``check_target_module_exists``
-of PEFT 0.21). A module is the name of its weight without ``.weight``, under VlmRewardModel's names.
+"""PEFT adapters, and which targeted modules lack factors, by PEFT's rules (``check_target_module_exists``, PEFT 0.21).
+
+A module is the name of its weight without ``.weight``, under VlmRewardModel's names.
 """
 
 from __future__ import annotations
@@ -47,10 +48,10 @@ from rfm.qwen.lora import BASE_LAYER, LORA_NAME, MERGE, module_of
 WHOLE, TEXT = "model.", "model.language_model."  # what PEFT wraps
 _ALL_LINEAR = "all-linear"
 _LAYER = re.compile(r"\.\d+\.")  # the first one in a name
-_PATTERN_S = 5  # for a pattern of an unknown author
-# Initialisations of factors that do not change the base model's weights.
+_PATTERN_S = 5  # for a pattern from an unknown author
+# Factor initialisations that do not change the base model's weights.
 _PLAIN_INITS = (True, False, "gaussian", "orthogonal")
-# Fields of adapter_config.json that change no score. Any other field, if set, may change the formula above.
+# Fields in adapter_config.json that change no score. Any other field, if set, may change the formula above.
 _HARMLESS = {
     "auto_mapping", "base_model_name_or_path", "bias", "ensure_weight_tying", "exclude_modules", "inference_mode",
     "init_lora_weights", "layers_pattern", "layers_to_transform", "lora_alpha", "lora_dropout", "megatron_core",
@@ -62,7 +63,7 @@ _HARMLESS = {
 
 @dataclass(frozen=True)
 class Scaling:
-    """Rank and alpha of LoRA factors, and the file with them."""
+    """Rank and alpha for LoRA factors, and the file that states them."""
 
     file: Path
     rank: int
@@ -70,7 +71,7 @@ class Scaling:
 
     @classmethod
     def of(cls, file: Path, config: Mapping[str, Any]) -> Scaling:
-        """Read a LoRA configuration. Raises CheckpointError for an adapter of another kind."""
+        """Read a LoRA configuration. Raises CheckpointError for another adapter type."""
         kind = config.get("peft_type", "LORA")
         if kind != "LORA":
             raise CheckpointError.at(f"{file}: peft_type", "LORA", shown(kind), MERGE)
@@ -85,7 +86,7 @@ class Scaling:
         return cls(file, rank, float(config["lora_alpha"]))
 
     def scaled(self, factors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the factors, with alpha / r in B. Raises CheckpointError for a factor A, [r, D], of another rank."""
+        """Return the factors, with alpha / r in B. Raises CheckpointError for a factor A, [r, D], with another rank."""
         scale = self.alpha / self.rank
         found = {}
         for name, factor in factors.items():
@@ -115,7 +116,7 @@ def check_adapter(file: Path, config: Mapping[str, Any]) -> None:
 
 
 def check_inside(tensors: Mapping[str, Tensor], file: Path) -> bool:
-    """Return True if there are LoRA factors among whole weights, those of ``file``.
+    """Return True if ``file`` holds LoRA factors among whole weights.
 
     Raises CheckpointError for a base layer whose factors are missing.
     """
@@ -133,14 +134,14 @@ _NO_EMBEDDING = (
     "lost with the run; save the whole model where it was trained (save_model() of the trainer), or the adapter with "
     "save_pretrained(..., save_embedding_layers=True)"
 )
-# In names of LoRA factors of embeddings, and of an embedding that PEFT saves in two ways at once.
+# In the names of embedding LoRA factors, and of an embedding that PEFT saves in two ways at once.
 _OTHER = re.compile(r"\.(lora_embedding_[AB]|modules_to_save|original_module)(\.|$)")
 _BASE_NAMES = ((r"^language_model\.", "model.language_model."), *QWEN_NAMES)  # the first: saved without a head
-_PARTS = ("model.language_model.", "model.visual.")  # in names of an adapter around all of them
+_PARTS = ("model.language_model.", "model.visual.")  # prefixes if the adapter wraps the whole model
 
 
 def has_adapter(folder: Path) -> bool:
-    """True if the folder's weights are an adapter alone; False also if upstream saved the whole model beside it.
+    """True if the folder's weights are only an adapter; also False if upstream saved the whole model beside it.
 
     Raises CheckpointError for an adapter beside other whole weights.
     """
@@ -189,7 +190,7 @@ def adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Te
 def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Return a base model's backbone: its configuration, and its weights under VlmRewardModel's names.
 
-    Weights in NF4 are decoded, as in training.
+    NF4 weights are decoded, as in training.
     """
     where = f"base model {base_model}"
     try:
@@ -203,7 +204,7 @@ def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if quantization(config) == NF4:
         del config["quantization_config"]
     check_not_quantized(config, f"{where}: {NETWORK_CONFIG}", UNQUANTIZED)
-    config.pop("transformers_version", None)  # of whoever saved the base model, not that of training
+    config.pop("transformers_version", None)  # from whoever saved the base model, not from training
     weights = renamed(read_weights(folder), _BASE_NAMES)
     dequantize(weights)
     dtype = getattr(torch, str(content.get("dtype") or content.get("torch_dtype")), None)  # in which transformers loads
@@ -213,18 +214,18 @@ def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
 def check_factors(
     file: Path, config: Mapping[str, Any], present: set[str], weights: Mapping[str, Tensor], root: str
 ) -> None:
-    """Raise CheckpointError for modules that an adapter trained, but whose factors are missing.
+    """Raise CheckpointError if an adapter trained modules whose factors are missing.
 
-    file: with ``config``, the adapter's configuration
+    file: states ``config``, the adapter's configuration
     present: modules with factors
-    weights: of the whole network
-    root: begins the names of the modules that PEFT wrapped
+    weights: weights of the whole network
+    root: prefix for the modules that PEFT wrapped
     """
     check_none_lost(file, _targeted(file, config, present, weights, root) - present)
 
 
 def check_none_lost(file: Path, lost: set[str]) -> None:
-    """Raise CheckpointError if factors are lost. file: the file that names their modules, for the message"""
+    """Raise CheckpointError if factors are lost. file: the file that names their modules, for the message."""
     if lost:
         got = f"none for {listed(sorted(lost))}: these modules would score as before training"
         remedy = "copy or save the weights again where they were trained"
@@ -232,7 +233,7 @@ def check_none_lost(file: Path, lost: set[str]) -> None:
 
 
 def check_replaced(file: Path, config: Mapping[str, Any], replaced: Iterable[str], weights: Iterable[str]) -> None:
-    """Raise CheckpointError for a weight of ``modules_to_save`` that an adapter lacks. replaced: weights that it has"""
+    """Raise CheckpointError if an adapter lacks a weight in ``modules_to_save``. replaced: weights that it has."""
     names = config.get("modules_to_save") or ()
     saved = {weight for weight in weights for name in names if f".{name}." in f".{weight}"}
     if missing := sorted(saved - set(replaced)):
@@ -243,7 +244,7 @@ def check_replaced(file: Path, config: Mapping[str, Any], replaced: Iterable[str
 def _targeted(
     file: Path, config: Mapping[str, Any], present: set[str], weights: Mapping[str, Tensor], root: str
 ) -> set[str]:
-    """Return the modules that ``config`` targets; if ``present`` has others, its kinds of modules in all layers."""
+    """Return the modules that ``config`` targets; if ``present`` has others, its module kinds in all layers."""
     axes = {name.removesuffix(".weight"): tensor.dim() for name, tensor in weights.items() if name.endswith(".weight")}
     modules = [module for module, dim in axes.items() if module.startswith(root) and dim > 1]
     for prefix in (root, WHOLE, ""):
@@ -257,7 +258,7 @@ def _targeted(
 
 
 def _matched(file: Path, config: Mapping[str, Any], keys: Mapping[str, int]) -> set[str]:
-    """Return the keys that ``target_modules`` and its exceptions name. keys: with the axes of each weight"""
+    """Return the keys that ``target_modules`` names, minus its exceptions. keys: how many axes each weight has."""
     wanted = config.get("target_modules") or []
     linear = {key for key, dim in keys.items() if dim == 2 and "embed" not in key.rpartition(".")[2]}
     found = linear if wanted == _ALL_LINEAR else _named(file, "target_modules", wanted, keys)
@@ -274,7 +275,7 @@ def _named(file: Path, field: str, names: list[str] | str, keys: Iterable[str]) 
     """Return the keys that end with one of ``names``, or that match it as a pattern."""
     if not isinstance(names, str):
         return {key for key in keys if any(f".{key}".endswith(f".{name}") for name in names)}
-    import regex  # of transformers; Python's own has no time limit
+    import regex  # a dependency of transformers; Python's own has no time limit
 
     try:
         return {key for key in keys if regex.fullmatch(names, key, timeout=_PATTERN_S)}
@@ -283,7 +284,7 @@ def _named(file: Path, field: str, names: list[str] | str, keys: Iterable[str]) 
 
 
 def _layer_of(key: str, patterns: list[str] | str | None) -> int | None:
-    """Return the layer's number in a key, behind one of the names ``patterns`` (none: behind any name)."""
+    """Return the layer number in a key, behind one of the names ``patterns`` (none: behind any name)."""
     names = [patterns] if isinstance(patterns, str) else patterns or [r"[^.]*"]
     for name in names:
         escaped = name if name == r"[^.]*" else re.escape(name)

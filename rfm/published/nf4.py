@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Weights in NF4 as bitsandbytes stores them: seven tensors for each weight.
+"""Weights in NF4 as bitsandbytes stores them: seven tensors per weight.
 
-Scales may be rounded too: to 8 bits, around an offset, with a scale for each block of scales.
+Scales may be rounded too: to 8 bits, around an offset, with one scale per block of scales.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ _VALUES_AT_ONCE = 2**22  # more would take more memory and save no time
 
 
 def dequantize(tensors: dict[str, Tensor], stays: Callable[[str], bool] | None = None) -> int:
-    """Replace NF4 weights by weights in their original dtype; return the number of NF4 weights.
+    """Replace NF4 weights by weights in their original dtype; return how many NF4 weights there were.
 
-    stays: True for the name of a weight that stays in NF4, as tensors of a layer; a weight of an odd number of columns
-        never does
+    stays: True for the name of a weight that stays in NF4, as a layer's tensors; a weight with an odd number of columns
+        never stays
     Raises CheckpointError for a weight whose parts are missing or do not fit.
     """
     names = [name.removesuffix(_STATE) for name in tensors if name.endswith(_STATE)]
@@ -98,7 +98,7 @@ def _decoded(packed: Tensor, scales: Tensor, state: Mapping[str, Any]) -> Tensor
     count, size, blocks = math.prod(state["shape"]), state["blocksize"], len(scales)
     packed = pad(packed, (0, (blocks * size - count) // VALUES_OF_BYTE))
     codes = torch.tensor(NF4_CODES)
-    pairs = torch.cartesian_prod(codes, codes)  # the two values of each byte, the higher bits first
+    pairs = torch.cartesian_prod(codes, codes)  # each byte's two values, the higher bits first
     whole = torch.empty(blocks, size, dtype=_DTYPES[state["dtype"]])
     step = _VALUES_AT_ONCE // size
     for start in range(0, blocks, step):

@@ -15,15 +15,15 @@ from rfm.files import MODEL_CARD, PROVENANCE, is_there, network_config
 
 OF_UPSTREAM = "default of upstream"
 _CARD_LICENSE = re.compile(r"\A---\n(?:.*\n)*?license: *(\S+) *\n")
-_NAMED_PARTS = 2  # of a path, whose rest may be private
-HUB_FOLDER = "models--"  # begins the name of a repository's folder in the Hub's cache
+_NAMED_PARTS = 2  # path parts to show; the rest may be private
+HUB_FOLDER = "models--"  # prefix of a repository's folder name in the Hub's cache
 
 
 @dataclass(frozen=True)
 class Assumption:
-    """A setting that scores depend on and neither weights nor files prove, so training may have used another.
+    """A setting that affects scores but that neither weights nor files prove, so training may have used another.
 
-    value: a value of JSON
+    value: a JSON value
     source: a default and its author, or the caller's option
     """
 
@@ -39,12 +39,12 @@ class Assumption:
 
 
 def snapshot_of(folder: Path) -> Path | None:
-    """Return the folder of a commit in the Hub's cache that is or holds ``folder``; None if there is none."""
+    """Return the commit folder in the Hub's cache that is or holds ``folder``; None if there is none."""
     return next((path for path in (folder, *folder.parents) if path.parent.name == "snapshots"), None)
 
 
 def source_name(source: str | Path) -> str:
-    """Return the public name of a checkpoint's source: the Hub id, also of a folder in its cache, or a path's end."""
+    """Return a checkpoint source's public name: the Hub id, also for a folder in its cache, or a path's end."""
     if not is_folder(source):
         return str(source)
     folder = Path(source).expanduser().resolve()
@@ -56,7 +56,7 @@ def source_name(source: str | Path) -> str:
 
 
 def license_of(folder: Path) -> str | None:
-    """Return the licence that a checkpoint's model card (README.md) or config.json states; None: neither does."""
+    """Return the licence in a checkpoint's model card (README.md) or config.json; None: neither states one."""
     card = folder / MODEL_CARD
     if is_there(card) and (found := _CARD_LICENSE.search(card.read_text(errors="replace"))):
         return found[1].strip("\"'")
@@ -75,7 +75,7 @@ def file_name(file: Path, folder: Path) -> str:
 
 
 def told(assumptions: Sequence[Assumption]) -> list[str]:
-    """Return one line for the user about all assumptions, or no line."""
+    """Return one line for the user about all assumptions, or an empty list."""
     listed = "; ".join(each.text for each in assumptions)
     line = f"assumed, and not shown by the checkpoint: {listed}; scores differ from the run's if it had others"
     return [line] if assumptions else []

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""A Qwen backbone's config.json and weights, as transformers wrote them: in a form that transformers 4.57 and 5 read
-alike.
+"""A Qwen backbone's config.json and weights from transformers, in a form that versions 4.57 and 5 read alike.
 
-Transformers 5 keeps a rotary embedding's settings in ``rope_parameters``, which 4.57 ignores. Before 4.52, a
-Qwen2.5-VL had no ``text_config``. Weights do not show how positions were rotated, so no such setting has a default.
+Transformers 5 keeps a rotary embedding's settings in ``rope_parameters``, which 4.57 ignores. Before 4.52, a Qwen2.5-VL
+had no ``text_config``. Weights do not show how positions were rotated, so no such setting has a default.
 
 The chat template writes a video as vision start, pad, vision end. The processor writes a time, vision start, pads and
 vision end for each temporal patch. Before transformers 5.10 (checked: 4.57.6, 5.5.4, 5.9.0) these replace all three
 tokens: the form is bare. Since 5.10 (checked: 5.10.1, 5.10.4, 5.24.0) they replace only the pad, so one more vision
-start and end remain around the video: the form is wrapped. Images, and videos of Qwen2.5-VL, did not change.
+start and end remain around the video: the form is wrapped. Images, and Qwen2.5-VL videos, did not change.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from rfm.files import CheckpointError, shown
 from rfm.published.provenance import Assumption
 from rfm.qwen.network import BACKBONES, BARE, QWEN_2_5, WRAPPED
 
-VISION_THETA = 10_000.0  # a constant in the code of transformers 4.57, for each backbone
-# Required fields of text_config and vision_config: no weight's shape shows them, and transformers has defaults.
+VISION_THETA = 10_000.0  # a constant in transformers 4.57's code, for every backbone
+# Required fields in text_config and vision_config: no weight's shape shows them, and transformers has defaults.
 _NEEDED = {
     QWEN_2_5: (
         ("num_attention_heads", "rms_norm_eps"),
@@ -41,7 +40,7 @@ _NOT_OF_TEXT = (
     "transformers_version", "video_token_id", "vision_config", "vision_end_token_id", "vision_start_token_id",
     "vision_token_id",
 )  # fmt: skip
-NF4 = "bitsandbytes nf4"  # a result of ``quantization``
+NF4 = "bitsandbytes nf4"  # a result from ``quantization``
 _ROPE = ("rope_theta", "rope_scaling", "rope_parameters", "partial_rotary_factor")
 UNQUANTIZED = (
     "export the checkpoint that was quantized (its scores differ), or load this one with the code that trained it, "
@@ -72,7 +71,7 @@ def backbone_config(content: Mapping[str, Any], where: object) -> dict[str, Any]
 
 
 def quantization(config: Any) -> str | None:
-    """Return the method by which weights were rounded to fewer bits, with bitsandbytes' type; None: they were not."""
+    """Return how weights were rounded to fewer bits, with bitsandbytes' type; None: they were not."""
     found = config.get("quantization_config") if isinstance(config, dict) else None
     if not found or not isinstance(found, dict):
         return str(found) if found else None
@@ -82,7 +81,7 @@ def quantization(config: Any) -> str | None:
 
 
 def check_not_quantized(config: Mapping[str, Any], where: object, remedy: str) -> None:
-    """Raise CheckpointError, with ``remedy`` at its end, if the configuration is of weights rounded to fewer bits."""
+    """Raise CheckpointError, ending with ``remedy``, if the configuration states weights rounded to fewer bits."""
     for part in (config, config.get("text_config")):
         if (found := quantization(part)) is not None:
             raise CheckpointError.at(f"{where}: quantization_config", "none", shown(found), remedy)
@@ -151,18 +150,18 @@ def _check_count(value: object, where: str) -> None:
         raise CheckpointError.at(where, "a whole number of at least 1", shown(value), _COPY)
 
 
-# Renames for a form of weights. The first pattern that matches a name is applied.
+# Renames for one form of weights. The first pattern that matches a name is applied.
 Renames: TypeAlias = Sequence[tuple[str, str]]
 LORA_INSIDE: Renames = ((r"^(model(\.\w+)?)\.base_model\.model\.", r"\1."),)
 ADAPTER_NAMES: Renames = ((r"^base_model\.model\.", "model."),)
-# For names of a Qwen backbone from transformers before 4.52, and in some cases since.
+# For Qwen backbone names from transformers before 4.52, and in some cases since.
 QWEN_NAMES: Renames = (
     (r"^visual\.", "model.visual."),
     (r"^model\.(embed_tokens|layers|norm)\.", r"model.language_model.\1."),
 )
 # Weights without effect on scores: the head that generates text, and rotary frequencies, which transformers computes.
 UNUSED = re.compile(r"(model\.)?lm_head\.weight|.*\.(rotary_emb|rotary_pos_emb)\.(original_)?inv_freq")
-# Tensors that bitsandbytes, GPTQ, AWQ and FP8 write beside or in place of a weight.
+# Tensors that bitsandbytes, GPTQ, AWQ and FP8 write beside or instead of a weight.
 QUANTIZED = re.compile(
     r"\.(absmax|quant_map|nested_absmax|SCB|qweight|qzeros|weight_packed|weight_scale|weight_scale_inv)$|\.quant_state\."
 )
@@ -197,9 +196,9 @@ def decided(
     """Return the form of a checkpoint's video prompts, and the form as an assumption if no file proves it.
 
     given: the caller's option
-    backbone: config.json as transformers saved it with the weights; empty: no file of the run is there
+    backbone: config.json as transformers saved it with the weights; empty: the run has no such file
     file: its name, for the source
-    may_be_saved_later: a later transformers than that of training may have saved the file
+    may_be_saved_later: a later transformers version than in training may have saved the file
     """
     if given is not None:
         return given, ()

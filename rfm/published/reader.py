@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a reader of published checkpoints makes of the user's options, and the ``Loaded`` that it returns."""
+"""How a reader of published checkpoints interprets the user's options, and the ``Loaded`` that it returns."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def check_used(options: CheckpointConfig, config: Any) -> None:
 
 
 def asked(options: CheckpointConfig) -> tuple[str | None, dict[str, str]]:
-    """Return the reward model's name and the user's settings of it, from ``name,setting=value,...``.
+    """Return the reward model's name and the user's settings for it, from ``name,setting=value,...``.
 
     Raises CheckpointError.
     """
@@ -45,9 +45,9 @@ def asked(options: CheckpointConfig) -> tuple[str | None, dict[str, str]]:
 
 
 def settings_asked(options: CheckpointConfig, known: Mapping[str, type]) -> dict[str, Any]:
-    """Return the user's settings of the reward model as numbers or booleans. Raises CheckpointError if one is wrong.
+    """Return the user's reward model settings as numbers or booleans. Raises CheckpointError if one is wrong.
 
-    known: type of each setting
+    known: types by setting
     """
     return {name: _value(name, text, known) for name, text in asked(options)[1].items()}
 
@@ -67,7 +67,7 @@ class Loaded:
     """A checkpoint as it was published, and what a user must know about it.
 
     assumptions: the settings that neither weights nor files prove
-    notes: returns a line for the user about each contradiction to the known facts of training; raises CheckpointError
+    notes: returns one line for the user per contradiction to the known facts about training; raises CheckpointError
     encoders: returns the checkpoint's encoders, or None; raises CheckpointError if they are missing or do not fit
     """
 
@@ -79,11 +79,11 @@ class Loaded:
 
 @dataclass(frozen=True)
 class Reader:
-    """Reads the checkpoints of a family as they were published, or as they were exported.
+    """Reads a family's checkpoints as they were published, or as they were exported.
 
-    reads: returns True if a folder may hold a checkpoint of the family; used if the caller names no family
-    load: loads the checkpoint of a local folder; raises CheckpointError
-    reward_models: names that ``--as`` takes, for ordinary models that the family asks in its own way
+    reads: returns True if a folder may hold a checkpoint in this family; used if the caller names no family
+    load: loads a checkpoint from a local folder; raises CheckpointError
+    reward_models: names that ``--as`` takes, for ordinary models that the family prompts in its own way
     """
 
     reads: Callable[[Path], bool]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""ReWiND checkpoints: the weights of the network and, under a prefix, of the encoders.
+"""ReWiND checkpoints: the network's weights and, under a prefix, the encoders'.
 
 Where configuration and weights disagree, the weights decide.
 """
@@ -79,7 +79,7 @@ def text_facts(source: str) -> dict[str, Any]:
 
 
 def differences(facts: dict[str, Any]) -> list[str]:
-    """Return the differences between upstream's encoder and another of the same width."""
+    """Return the differences between upstream's encoder and another with the same width."""
     known = _IMAGE if "crop_px" in facts else _TEXT
     if facts["hidden_size"] != known["hidden_size"]:
         return []
@@ -88,15 +88,15 @@ def differences(facts: dict[str, Any]) -> list[str]:
 
 IMAGE_ENCODER_PREFIX = "image_encoder."
 TEXT_ENCODER_PREFIX = "text_encoder."
-# Upstream's configurations from before causal_mask state all of these fields; no network had a causal mask then.
+# Upstream's configurations from before causal_mask state all these fields; no network had a causal mask then.
 _FIRST_FIELDS = ("video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "num_attention_heads", "max_len")
-# Upper limits of a network's sizes, against files that would only cost memory and time; the lower limit is 1.
+# Upper size limits for a network, against files that would only cost memory and time; the lower limit is 1.
 _LIMITS = dict.fromkeys((*_FIRST_FIELDS, "progress_bins"), MAX_COUNT) | {"num_layers": 1024}
 _LAYERS = "transformer.layers."
 _STATED_TYPES: dict[str, type] = {"num_attention_heads": int, "max_len": int, "causal_mask": bool}
-# The paper's code, the first (https://github.com/Jiahui-3205/ReWiND_Release), has progress alone, other names and no
-# configuration. Its networks all have 8 attention heads and a causal mask. Its training script shows 16 frames by
-# default.
+# The paper's first code (https://github.com/Jiahui-3205/ReWiND_Release) predicts only progress, uses other names and
+# has no configuration. Its networks all have 8 attention heads and a causal mask. Its training script shows 16 frames
+# by default.
 _FIRST_CODES_FRAME = "first_pos_embed"  # [1, D]; added to the first frame
 _FIRST_CODES_UNREAD = "class_token"  # a parameter that the network never reads
 _FIRST_CODES_SETTINGS = {"num_attention_heads": 8, "causal_mask": True, "max_len": 16}
@@ -104,7 +104,7 @@ _FIRST_CODES_SETTINGS = {"num_attention_heads": 8, "causal_mask": True, "max_len
 
 @dataclass(frozen=True)
 class PretrainedEncoders:
-    """The encoders of a published checkpoint, which no file of a training run names.
+    """The encoders for a published checkpoint, which no training run file names.
 
     image_source, text_source: folders or ids that the user named; None: upstream's
     """
@@ -115,7 +115,7 @@ class PretrainedEncoders:
 
     @property
     def _are_used(self) -> bool:
-        """True if the checkpoint has weights of encoders, or the user named one."""
+        """True if the checkpoint has encoder weights, or the user named an encoder."""
         own = self.checkpoint
         return any(map(bool, (own.image_encoder, own.text_encoder, self.image_source, self.text_source)))
 
@@ -124,7 +124,7 @@ class PretrainedEncoders:
         return self.image_source or IMAGE_ENCODER, self.text_source or TEXT_ENCODER
 
     def notes(self) -> list[str]:
-        """Return a line for each encoder that differs from upstream's of the same width."""
+        """Return one line per encoder that differs from upstream's with the same width."""
         if not self._are_used:
             return []
         compared = zip((IMAGE_ENCODER, TEXT_ENCODER), self._sources, map(differences, self._facts()), strict=True)
@@ -154,7 +154,7 @@ class PretrainedEncoders:
             return image_facts(image_source), text_facts(text_source)
 
     def load(self) -> Encoders | None:
-        """Return the encoders if the checkpoint has their weights or the user names them; else None.
+        """Return the encoders if the checkpoint has their weights or the user names them, otherwise None.
 
         Raises CheckpointError if they are missing or do not fit the network.
         """
@@ -195,7 +195,7 @@ def reads(folder: Path) -> bool:
 
 
 def load(folder: Path, options: CheckpointConfig) -> Loaded:
-    """Load the checkpoint of a local folder. Raises CheckpointError."""
+    """Load a checkpoint from a local folder. Raises CheckpointError."""
     network = read_weights(folder)
     if _FIRST_CODES_FRAME in network:
         return _of_first_code(folder, network, options)
@@ -271,14 +271,14 @@ def _config(folder: Path, weights: Mapping[str, Tensor], stated: Mapping[str, An
 
 
 def _shape(weights: Mapping[str, Tensor], name: str, rank: int) -> torch.Size:
-    """Return a weight's shape. Raises KeyError if it is missing, CheckpointError if it has not ``rank`` axes."""
+    """Return a weight's shape. Raises KeyError if it is missing, CheckpointError unless it has ``rank`` axes."""
     shape = weights[name].shape
     require(name, len(shape) == rank, f"{rank} axes", list(shape), CheckpointError)
     return shape
 
 
 def _stated(folder: Path) -> tuple[dict[str, Any], tuple[Assumption, ...]]:
-    """Return the network's settings by config.json and config.yaml, and those of them that neither proves.
+    """Return the network's settings from config.json and config.yaml, and the settings that neither proves.
 
     Raises CheckpointError if the files disagree.
     """
@@ -309,7 +309,7 @@ def _stated(folder: Path) -> tuple[dict[str, Any], tuple[Assumption, ...]]:
     if "causal_mask" not in stated and any(content.keys() >= {*_FIRST_FIELDS} for content in sources.values()):
         stated["causal_mask"] = False
         assumed = (Assumption("causal_mask", False, f"{OF_UPSTREAM} of before causal_mask"),)
-    # ``save`` wrote these into config.json; else the run's file has them.
+    # ``save`` wrote these into config.json; otherwise the run's file has them.
     frames = frame_count(saved.get("trained_frames"), f"{folder / NETWORK_CONFIG}: trained_frames")
     if frames is None and run_file is not None:
         frames = trained_frames(run, run_file)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read Robo-Dopamine: an ordinary Qwen-VL, which only its name tells from others."""
+"""Read Robo-Dopamine: an ordinary Qwen-VL that only its name identifies."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _OF_USER: dict[str, type] = {"mode": str, "interval": int}  # settings that ``--
 
 
 def load(folder: Path, options: CheckpointConfig) -> Loaded:
-    """Load the model of a local folder: a Qwen-VL's, or an export. Raises CheckpointError."""
+    """Load the model from a local folder: a Qwen-VL's, or an export. Raises CheckpointError."""
     if options.video_prompt is not None:
         expected = "none: the prompt of this checkpoint has images"
         raise CheckpointError.at("--video-prompt", expected, options.video_prompt)

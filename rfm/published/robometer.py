@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Read RFM and Robometer checkpoints: whole weights, perhaps with LoRA factors, or an adapter to a base model.
+"""Read RFM and Robometer checkpoints: whole weights, optionally with LoRA factors, or an adapter to a base model.
 
-A table of renames for each form turns the names of weights into those of VlmRewardModel.
+Every format has a rename table, which maps weight names to VlmRewardModel's.
 """
 
 from __future__ import annotations
@@ -73,14 +73,14 @@ class PublishedVlm(VlmCheckpoint):
     has_processor: bool = False
 
     def load_collator(self) -> VlmCollator:
-        """Return the collator. Raises CheckpointError if the caller's base model is not like the one of the run."""
+        """Return the collator. Raises CheckpointError if the caller's base model differs from the run's."""
         collator = super().load_collator()
         if self.base_model is not None and _is_published(self.config.base_model_id, self.config.family):
             _check_published(collator, self.base_model)
         return collator
 
     def notes(self) -> list[str]:
-        """Return a line for each sign that prompts, images or positions differ from those in training."""
+        """Return one line per sign that prompts, images or positions differ from those in training."""
         lines = []
         if not self.has_processor and (found := _differences(self.collator)):
             known = f"the published processors of {self.config.family}"
@@ -98,7 +98,7 @@ class PublishedVlm(VlmCheckpoint):
 
 
 def reads(folder: Path) -> bool:
-    """True if the folder holds an adapter, a network on a known backbone, or a Robometer of LeRobot."""
+    """True if the folder holds an adapter, a network on a known backbone, or LeRobot's Robometer."""
     if is_there(folder / ADAPTER_CONFIG):
         return True
     content = network_config(folder)
@@ -107,7 +107,7 @@ def reads(folder: Path) -> bool:
 
 
 def load(folder: Path, options: CheckpointConfig) -> Loaded:
-    """Load the checkpoint of a local folder. Raises CheckpointError."""
+    """Load a checkpoint from a local folder. Raises CheckpointError."""
     assumptions: tuple[Assumption, ...] = ()
     if is_saved(folder):
         parts = _exported(folder)
@@ -127,7 +127,7 @@ _Read: TypeAlias = tuple[VlmConfig, dict[str, Tensor], dict[str, Tensor], tuple[
 
 
 def _exported(folder: Path) -> _Parts:
-    """Return the parts of an export, whose processor and form of weights the caller may change."""
+    """Return an export's parts; the caller may change its processor and weight format."""
     restored = restore(folder)
     return restored.config, restored.weights, restored.factors, restored.processor
 
@@ -149,7 +149,7 @@ def _with_video_prompt(
 ) -> tuple[VlmConfig, tuple[Assumption, ...]]:
     """Return the configuration with the form of its video prompts, and the form if it is assumed.
 
-    content: config.json of the run; empty for an adapter, whose base model may be saved by another transformers
+    content: the run's config.json; empty for an adapter, whose base model another transformers may have saved
     """
     file = f"{NETWORK_CONFIG}: {LEROBOT_BACKBONE}" if is_lerobot(content) else NETWORK_CONFIG
     form, assumed = decided(options.video_prompt, config.backbone if content else {}, file)
@@ -169,7 +169,7 @@ def _by_lerobot(folder: Path, content: Mapping[str, Any], base_model: str | None
 
 
 def _trained(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Read:
-    """Read the checkpoint of a training run, with the run's config.yaml. content: {} for an adapter."""
+    """Read a training run's checkpoint, with the run's config.yaml. content: {} for an adapter."""
     file = folder / NETWORK_CONFIG
     backbone = backbone_config(content, file) if content else {}
     is_nf4, num_nf4 = read_unrounded_config(backbone, file), 0
@@ -227,14 +227,14 @@ def _whole(
 
 
 def _used(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Return the weights that scores depend on, and their LoRA factors; ``scaling``: of these."""
+    """Return the weights that scores depend on, and their LoRA factors; ``scaling``: for these."""
     weights, factors = split(tensors)
     factors = factors if scaling is None else scaling.scaled(factors)
     weights = {name: tensor for name, tensor in weights.items() if not UNUSED.fullmatch(name)}
     return weights, {name: tensor for name, tensor in factors.items() if changed_by(name) in weights}
 
 
-# The published processors of the families of backbones, with which a run's own is compared.
+# The published processors by backbone family, with which a run's own is compared.
 _EXAMPLE = "TASK"
 _QWEN_PROMPT = "<|im_start|>user\nTASK{visual} 1: <|vision_start|><|{pad}_pad|><|vision_end|><|im_end|>\n"
 _PUBLISHED_NAMES = {
@@ -258,7 +258,7 @@ def _is_published(base_model_id: str, family: str) -> bool:
 
 
 def _facts(collator: VlmCollator) -> dict[str, Any]:
-    """Return a processor's effect, as JSON: the text of a conversation with an image or video, and image settings."""
+    """Return a processor's effect as JSON: a conversation's text with an image or video, and image settings."""
     visual = Visual.IMAGE if collator.config.multi_image else Visual.VIDEO
     images = {**collator.images.to_config()}
     del images["rescale_factor"]  # the same for every processor that loads
@@ -268,7 +268,7 @@ def _facts(collator: VlmCollator) -> dict[str, Any]:
 
 
 def _check_published(collator: VlmCollator, processor: str) -> None:
-    """Raise CheckpointError if a processor in place of a published processor differs from it."""
+    """Raise CheckpointError if a processor that replaces a published one differs from it."""
     found = _differences(collator)
     if found:
         named = collator.config.base_model_id
@@ -280,7 +280,7 @@ def _check_published(collator: VlmCollator, processor: str) -> None:
 
 
 def _differences(collator: VlmCollator) -> list[str]:
-    """Return the differences between a processor and the published processors of its family of backbones."""
+    """Return the differences between a processor and those published for its backbone family."""
     words = (
         {"visual": "Picture", "pad": "image"} if collator.config.multi_image else {"visual": "Video", "pad": "video"}
     )

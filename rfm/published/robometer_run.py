@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""config.yaml of a vision-language training run: the settings that weights do not hold.
+"""config.yaml from a vision-language training run: the settings that weights do not hold.
 
 ``make reference`` writes SETTINGS and the defaults into docs/reference/checkpoints.md.
 """
@@ -33,11 +33,11 @@ from rfm.qwen.lora import MERGE
 from rfm.qwen.network import QWEN_2_5, Dtype
 from rfm_client.contract.checks import require
 
-HEADS, VQA = "default", "vqa"  # values of model.model_type: reward heads, generated text
+HEADS, VQA = "default", "vqa"  # values for model.model_type: reward heads, generated text
 DTYPES: tuple[Dtype, ...] = get_args(Dtype)
 POOLINGS = ("mean", "boundary", "attention")
 _SECTIONS = ("model", "data", "training", "peft")
-# The keys of a run's configuration that decide fields of VlmConfig; two keys must agree.
+# The run configuration keys that decide fields of VlmConfig; two keys must agree.
 SETTINGS = {
     "dtype": ("model.torch_dtype",),
     "multi_image": ("model.use_multi_image", "data.use_multi_image"),
@@ -49,19 +49,19 @@ SETTINGS = {
     "size_px": ("data.resized_height", "data.resized_width"),
     "trained_frames": ("data.max_frames",),
 }
-_FEW_BITS = re.compile(r"-bnb-4bit/?$")  # Unsloth's names of base models in NF4, on which it trains
+_FEW_BITS = re.compile(r"-bnb-4bit/?$")  # Unsloth's names for base models in NF4, on which it trains
 _VARIANT = re.compile(r"(-unsloth)?(-bnb-4bit)?$")  # Unsloth's names for its copies of a base model
-_DROPPED = ("pairwise_progress", "use_progress_token")  # settings of prompts that upstream has dropped
+_DROPPED = ("pairwise_progress", "use_progress_token")  # prompt settings that upstream has dropped
 Value = TypeVar("Value", bool, str, float)
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """The sections of a run's config.yaml. As upstream, a null means that the key is missing.
+    """The sections in a run's config.yaml. As upstream, a null means that the key is missing.
 
     file: path of config.yaml
     name: its path relative to the checkpoint's folder
-    has_sections: False: the file has no sections, and messages name the key alone
+    has_sections: False: the file has no sections, and messages name only the key
     """
 
     file: Path
@@ -71,7 +71,7 @@ class RunConfig:
 
     @classmethod
     def of(cls, folder: Path) -> RunConfig:
-        """Read the run configuration of the checkpoint in ``folder``.
+        """Read the run configuration for the checkpoint in ``folder``.
 
         Raises CheckpointError if there is none, or it is not upstream's.
         """
@@ -156,7 +156,7 @@ class RunConfig:
         return self.sections[section].get(key) is not None
 
     def get(self, place: str, default: Value) -> Value:
-        """Return the value at ``section.key``, else the default. Raises CheckpointError for another type."""
+        """Return the value at ``section.key``, otherwise the default. Raises CheckpointError for another type."""
         section, _, key = place.partition(".")
         value = self.sections[section].get(key)
         if value is None:
@@ -184,7 +184,7 @@ class RunConfig:
 
 
 def base_of_adapter(folder: Path, run: RunConfig) -> str:
-    """Return the base model that the run names, or the form of it in NF4 that the adapter names.
+    """Return the base model that the run names, or the NF4 form of it that the adapter names.
 
     Raises CheckpointError if the adapter names another, or if the run began with a checkpoint, whose weights the
     adapter may change.
@@ -208,10 +208,10 @@ def base_of_adapter(folder: Path, run: RunConfig) -> str:
 def assumptions_of(
     config: VlmConfig, run: RunConfig, base_model: str | None, num_nf4: int = 0
 ) -> tuple[Assumption, ...]:
-    """Return the settings of a checkpoint that neither weights nor files prove.
+    """Return a checkpoint's settings that neither weights nor files prove.
 
     base_model: the caller's option
-    num_nf4: number of weights in NF4, which may have been rounded after training
+    num_nf4: how many weights are in NF4, which may have been rounded after training
     """
     idle = {"average_temporal_patches", "size_px"} if config.multi_image else set()  # settings without effect
     idle |= set() if config.pools_images else {"frame_pooling"}
@@ -236,7 +236,7 @@ def assumptions_of(
 
 
 def _model_name(base: str) -> str:
-    """Return the name by which ids and paths of the same base model are compared."""
+    """Return the name by which ids and paths for the same base model are compared."""
     return _VARIANT.sub("", base.rstrip("/").rpartition("/")[2].lower())
 
 
@@ -244,7 +244,7 @@ LEROBOT_TYPE = "robometer"  # the value of config.json's key ``type``
 LEROBOT_BACKBONE = "vlm_config"  # the key of the backbone's configuration
 _LEROBOT_NAMES: Renames = ((r"^model\.model\.", "model."),)
 _EMBEDDING, _TEXT_HEAD = "model.language_model.embed_tokens.weight", "model.lm_head.weight"
-# Keys of config.json that decide scores, by their section in the config.yaml of a Robometer run.
+# Keys in config.json that decide scores, by their section in a Robometer run's config.yaml.
 _DECIDING = {
     "model": (
         "average_temporal_patches", "base_model_id", "frame_pooling", "frame_pooling_attn_temperature", "torch_dtype",
@@ -262,7 +262,7 @@ _LEROBOT_IDLE = {
 
 
 def is_lerobot(content: Mapping[str, Any]) -> bool:
-    """True if this config.json is a Robometer's of LeRobot."""
+    """True if this config.json comes from LeRobot's Robometer."""
     return content.get("type") == LEROBOT_TYPE
 
 
@@ -276,7 +276,7 @@ def lerobot_run(content: Mapping[str, Any], file: Path) -> RunConfig:
         if content.get(key) is None:
             raise CheckpointError.at(f"{file}: {key}", "a value", "none", "save the model with LeRobot again")
     sections = {name: {key: content.get(key) for key in keys} for name, keys in _DECIDING.items()}
-    sections["data"] |= {"resized_height": None, "resized_width": None}  # LeRobot has no common size of frames
+    sections["data"] |= {"resized_height": None, "resized_width": None}  # LeRobot has no common frame size
     return RunConfig(file, NETWORK_CONFIG, {"training": {}, "peft": {}, **sections}, has_sections=False)
 
 
@@ -292,7 +292,7 @@ def lerobot_weights(tensors: Mapping[str, Tensor], backbone: Mapping[str, Any]) 
 
 
 def check_bins(content: Mapping[str, Any], weights: Mapping[str, Tensor], file: Path) -> None:
-    """Raise CheckpointError if config.json states other progress bins than the weights have."""
+    """Raise CheckpointError if config.json and the weights disagree about progress bins."""
     loss, bins = content.get(_LOSS), content.get(_BINS)
     if loss not in _LOSSES:
         raise CheckpointError.at(f"{file}: {_LOSS}", f"one of {', '.join(_LOSSES)}", shown(loss))

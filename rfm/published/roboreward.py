@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read RoboReward: an ordinary Qwen3-VL, which only its name tells from others."""
+"""Read RoboReward: an ordinary Qwen3-VL that only its name identifies."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from rfm.published.provenance import Assumption
 from rfm.published.reader import Loaded, Reader, asked, settings_asked
 from rfm.saved import is_saved
 
-WRITTEN, EXPECTED = "roboreward", "roboreward-expected"  # of ``--as``
+WRITTEN, EXPECTED = "roboreward", "roboreward-expected"  # values for ``--as``
 REWARD_MODELS = (WRITTEN, EXPECTED)
 
 
 def load(folder: Path, options: CheckpointConfig) -> Loaded:
-    """Load the model of a local folder: a Qwen3-VL's, or an export. Raises CheckpointError."""
+    """Load the model from a local folder: a Qwen3-VL's, or an export. Raises CheckpointError."""
     name, _ = asked(options)
     settings_asked(options, {})
     assumptions: tuple[Assumption, ...] = ()

@@ -36,7 +36,7 @@ def read_unrounded_config(backbone: dict[str, Any], file: Path) -> bool:
 
 
 def read_published(folder: Path, is_nf4: bool, model_type: str | None = None) -> tuple[dict[str, Tensor], int]:
-    """Return a folder's tensors, and the number of weights in NF4. Those of layers stay in NF4, others are decoded.
+    """Return a folder's tensors, and how many weights are in NF4. Layers stay in NF4, other weights are decoded.
 
     is_nf4: True if config.json says that some are in NF4
     model_type: as in ``read_weights``
@@ -54,17 +54,17 @@ def read_published(folder: Path, is_nf4: bool, model_type: str | None = None) ->
 
 
 def kind_of(weights: Mapping[str, Tensor]) -> Weights | None:
-    """Return the form of weights as they were published: NF4, or None."""
+    """Return the format in which weights were published: NF4, or None."""
     return _NF4 if any(name.endswith(DECODED) for name in weights) else None
 
 
 def round_layers(
     weights: Mapping[str, Tensor], factors: Mapping[str, Tensor], kind: Weights, dtype: torch.dtype
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Return the weights with those of layers rounded, and the LoRA factors of the others.
+    """Return the weights with rounded layers, and the LoRA factors for the others.
 
-    factors: of LoRA, which are added before rounding
-    dtype: of the decoded values
+    factors: LoRA factors, which are added before rounding
+    dtype: type of decoded values
     """
     whole: dict[str, Tensor] = {}
     rest = dict(factors)
@@ -80,9 +80,9 @@ def round_layers(
 def rounded_as_asked(
     config: Any, weights: dict[str, Tensor], factors: dict[str, Tensor], kind: Weights | None
 ) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
-    """Return a checkpoint's configuration, weights and LoRA factors, with the layers rounded if the user asks for it.
+    """Return a checkpoint's configuration, weights and LoRA factors, with layers rounded if the user asks for it.
 
-    kind: the user's option; None, or layers that are rounded already: nothing changes
+    kind: the user's option; None, or layers that are already rounded: nothing changes
     """
     if kind is None or config.weights is not None:
         return config, weights, factors

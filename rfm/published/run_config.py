@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""config.yaml of the training run: its place, and how the run trained the heads, which no score shows."""
+"""config.yaml from the training run: where it lies, and how the run trained the heads, which no score shows."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 PROGRESS, PREFERENCE, SUCCESS, SIMILARITY = HEADS = ("progress", "preference", "success", "similarity")
-FROM_FIRST_FRAME = "absolute_first_frame"  # a value of data.progress_pred_type
+FROM_FIRST_FRAME = "absolute_first_frame"  # a value for data.progress_pred_type
 MAX_COUNT = 2**20  # frames; longer than any trajectory
 _COMMIT_DIGITS = 40
 
@@ -34,7 +34,7 @@ _COMMIT_DIGITS = 40
 def find_run_config(folder: Path) -> Path | None:
     """Return the run's configuration file: in the checkpoint's folder, its parent, or these on main in the Hub's cache.
 
-    Raises CheckpointError if a file outside the folder belongs to another kind of network.
+    Raises CheckpointError if a file outside the folder belongs to another network type.
     """
     home = folder.resolve()
     for place in (folder, home.parent, *_places_on_main(home)):
@@ -62,7 +62,7 @@ def _check_base(file: Path, folder: Path) -> None:
 
 
 def _places_on_main(home: Path) -> list[Path]:
-    """Return ``home`` (and its parent, for a subfolder) in the snapshot of main in the Hub's cache."""
+    """Return ``home`` (and its parent, for a subfolder) in main's snapshot in the Hub's cache."""
     snapshot = next((path for path in (home, *home.parents) if path.parent.name == "snapshots"), home)
     main = snapshot.parent.parent / "refs" / "main"
     if snapshot.parent.name != "snapshots" or not is_there(main):
@@ -76,13 +76,13 @@ def _places_on_main(home: Path) -> list[Path]:
 
 
 def section_of(run: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    """Return a section of the configuration; empty if it is no mapping, which the family refuses."""
+    """Return a section from the configuration; empty if it is no mapping, which the family refuses."""
     section = run.get(name)
     return section if isinstance(section, dict) else {}
 
 
 def trained_frames(run: Mapping[str, Any], file: Path) -> int | None:
-    """Return data.max_frames of config.yaml, the largest number of frames of a trajectory in training, or None.
+    """Return data.max_frames from config.yaml, the frame count of the longest trajectory in training, or None.
 
     Raises CheckpointError.
     """
@@ -93,7 +93,7 @@ def trained_frames(run: Mapping[str, Any], file: Path) -> int | None:
 
 
 def frame_count(frames: Any, where: str) -> int | None:
-    """Return ``frames`` if it is None or a valid number of frames. Raises CheckpointError otherwise."""
+    """Return ``frames`` if it is None or a valid frame count. Raises CheckpointError otherwise."""
     if frames is not None and (type(frames) is not int or frames < 1):
         raise CheckpointError.at(where, "a whole number of at least 1", shown(frames))
     if frames is not None and frames > MAX_COUNT:
@@ -102,7 +102,7 @@ def frame_count(frames: Any, where: str) -> int | None:
 
 
 def check_progress(run: Mapping[str, Any], file: Path) -> None:
-    """Raise CheckpointError for a head that was trained on increments of progress.
+    """Raise CheckpointError for a head that was trained on progress increments.
 
     run: config.yaml, read from ``file``
     """
@@ -116,7 +116,7 @@ def check_progress(run: Mapping[str, Any], file: Path) -> None:
 
 
 def training_notes(folder: Path, answered: Collection[str]) -> list[str]:
-    """Return a line for the user about each setting of the training run that makes scores doubtful.
+    """Return one line for the user per training run setting that makes scores doubtful.
 
     answered: heads that the model serves; an earlier run may have trained them
     Raises CheckpointError for a config.yaml that cannot be read.
@@ -157,7 +157,7 @@ def training_notes(folder: Path, answered: Collection[str]) -> list[str]:
 
 
 def constant_heads(weights: Mapping[str, Tensor], answered: Collection[str]) -> list[str]:
-    """Return a line for the user about each head of ``answered`` whose last weight is 0 throughout, as if untrained."""
+    """Return one line for the user per head in ``answered`` whose last weight is 0 throughout, as if untrained."""
     heads = {head: weights.get(f"{head}_head.4.weight") for head in answered}
     return [
         f"{WEIGHTS}: {head}_head.4.weight is 0 throughout: {head} is the same whatever is scored, as if untrained"

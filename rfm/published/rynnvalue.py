@@ -30,7 +30,7 @@ from rfm.saved import is_saved, reward_model_of
 ISOLATED = "pred_slot_isolated_eager"
 _CAUSAL = ("eager", "sdpa", "flash_attention_2", "flash_attention_3", "flex_attention")
 _STYLE = "interleaved_history"
-# Facts of the published checkpoints, for keys that a file lacks.
+# Facts from the published checkpoints, for keys that a file lacks.
 _HEAD = {"head_type": "bro", "hidden_dims": 4096, "depth": 8, "activation": "relu"}
 _BINS = {"bins": 256, "support_transform": "symlog", "bin_edges": None}
 PUBLISHED: dict[str, Any] = {
@@ -44,7 +44,7 @@ PUBLISHED: dict[str, Any] = {
     "relative_value_tokenizer_config": {**_BINS, "min_value": -256.0, "max_value": 256.0},
     "use_meta": True,
 }
-# Keys without effect on scores: of transformers, of training, and of the remote code.
+# Keys without effect on scores: for transformers, for training, and for the remote code.
 _IDLE = {
     "_name_or_path", "architectures", "auto_map", "bos_token_id", "dtype", "encoding", "eos_token_id",
     "hl_gauss_sigma_ratio", "bin_edges_path", "initializer_range", "model_type", "pad_token_id", "processor_class",
@@ -60,7 +60,7 @@ _COPY = "copy the file as it was published"
 
 @dataclass
 class Settings:
-    """What the files of a checkpoint say, and what they lack.
+    """What a checkpoint's files say, and what they lack.
 
     unexpected: keys that are read nowhere
     """
@@ -73,7 +73,7 @@ class Settings:
 
     @classmethod
     def read(cls, folder: Path, content: Mapping[str, Any]) -> Settings:
-        """Return the settings of a folder with this config.json. Raises CheckpointError."""
+        """Return the settings from a folder with this config.json. Raises CheckpointError."""
         file = folder / PROCESSOR_CONFIG
         settings = cls(folder, content, read_json(file) if is_there(file) else {})
         known = PUBLISHED.keys() | _IDLE | _KEYS_OF_BACKBONE | _OF_TOKENS
@@ -96,7 +96,7 @@ class Settings:
         }
 
     def token(self, key: str, token: str, tokenizer: Any) -> int:
-        """Return the id of a token, on which config.json and tokenizer agree. Raises CheckpointError."""
+        """Return a token's id, on which config.json and tokenizer agree. Raises CheckpointError."""
         known = tokenizer.get_vocab().get(token)
         if known is None:
             raise CheckpointError.at(f"{self.folder}: tokenizer", f"a token {token}", "none", _COPY)
@@ -170,7 +170,7 @@ class Settings:
         return Bins(count, transform, float(ends[0]), float(ends[1]), edges)
 
     def _section(self, key: str) -> dict[str, Any]:
-        """Return a section of config.json, with the published values of keys that it lacks."""
+        """Return a section from config.json, with the published values for keys that it lacks."""
         stated = self._value(key)
         if not isinstance(stated, Mapping):
             raise CheckpointError.at(f"{self._file}: {key}", "settings", shown(stated))
@@ -205,7 +205,7 @@ def _edges(edges: Any, count: int, where: str) -> tuple[float, ...]:
 
 MODEL_TYPE = "rynn_value_lang"
 _EXAMPLE = '--robot-description "a Franka single-arm robot" --camera-description "the main right camera"'
-_OF_BACKBONE = "model."  # begins the names of the backbone's weights
+_OF_BACKBONE = "model."  # prefix of the backbone's weights
 
 
 def reads(folder: Path) -> bool:
@@ -214,7 +214,7 @@ def reads(folder: Path) -> bool:
 
 
 def load(folder: Path, options: CheckpointConfig) -> Loaded:
-    """Load the checkpoint of a local folder. Raises CheckpointError."""
+    """Load a checkpoint from a local folder. Raises CheckpointError."""
     if is_saved(folder):
         return _exported(folder, options)
     content = read_json(folder / NETWORK_CONFIG)
@@ -255,7 +255,7 @@ def _published(folder: Path, content: dict[str, Any], options: CheckpointConfig)
 
 
 def _exported(folder: Path, options: CheckpointConfig) -> Loaded:
-    """Load an export, with the processor, descriptions and form of weights that the user asks for."""
+    """Load an export, with the processor, descriptions and weight format that the user asks for."""
     checkpoint = RynnCheckpoint.restore(folder)
     changed = _descriptions(options) if checkpoint.config.use_meta else {}
     config, processor = replace(checkpoint.config, **changed), options.base_model or checkpoint.processor
@@ -273,14 +273,14 @@ def _rounded(checkpoint: RynnCheckpoint, options: CheckpointConfig) -> RynnCheck
 
 
 def _set_rows(backbone: dict[str, Any], weights: Mapping[str, Tensor], file: Path) -> None:
-    """Take the rows of the embedding from the weights: its padding may have been kept or cut."""
+    """Take the embedding's row count from the weights: its padding may have been kept or cut."""
     if EMBEDDING not in weights:
         raise CheckpointError.at(file.parent, f"a weight {EMBEDDING}", "none")
     backbone["text_config"]["vocab_size"] = len(weights[EMBEDDING])
 
 
 def _descriptions(options: CheckpointConfig) -> dict[str, str]:
-    """Return the user's descriptions of robot and camera, by setting."""
+    """Return the user's descriptions for robot and camera, by setting."""
     return {name: words for name in META if (words := getattr(options, name))}
 
 

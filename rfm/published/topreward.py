@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read TOPReward: the settings of LeRobot, or of the user, and an ordinary Qwen3-VL."""
+"""Read TOPReward: settings from LeRobot, or from the user, and an ordinary Qwen3-VL."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from rfm.qwen.processor import (
 from rfm.saved import is_saved, reward_model_of
 from rfm_client.contract.checks import require
 
-LEROBOT, ROBOMETER = "topreward", "topreward-robometer"  # of ``--as``
+LEROBOT, ROBOMETER = "topreward", "topreward-robometer"  # values for ``--as``
 REWARD_MODELS = (LEROBOT, ROBOMETER)
-_TYPE = "topreward"  # the value of the key ``type`` of LeRobot's config.json
+_TYPE = "topreward"  # the key ``type`` in LeRobot's config.json
 FPS = 2.0  # LeRobot's default
-MAX_FRAMES, NUM_PREFIXES = 64, 15  # of Robometer's baseline
-MOST_FRAMES = 512  # default limit of LeRobot's variant: each prefix costs a question
-# Keys of LeRobot's config.json about its own pipelines, uploads and cropping of online samples.
+MAX_FRAMES, NUM_PREFIXES = 64, 15  # in Robometer's baseline
+MOST_FRAMES = 512  # default limit in LeRobot's variant: each prefix costs a question
+# Keys in LeRobot's config.json about its own pipelines, uploads and cropping online samples.
 _IDLE = {
     "attn_implementation", "default_task", "device", "image_key", "input_features", "license", "max_frames",
     "max_input_length", "normalization_mapping", "output_features", "pretrained_path", "pretrained_revision",
@@ -47,12 +47,12 @@ _OF_USER = {"num_prefixes": int, "fps": float, "chat_template": bool, "max_frame
 
 
 def reads(folder: Path) -> bool:
-    """True if the folder holds LeRobot's settings of TOPReward, or an export of it."""
+    """True if the folder holds LeRobot's TOPReward settings, or an export of TOPReward."""
     return network_config(folder).get("type") == _TYPE or reward_model_of(folder) == TopRewardConfig.reward_model
 
 
 def load(folder: Path, options: CheckpointConfig) -> Loaded:
-    """Load the model of a local folder: a Qwen3-VL's, LeRobot's settings, or an export. Raises CheckpointError."""
+    """Load the model from a local folder: a Qwen3-VL's, LeRobot's settings, or an export. Raises CheckpointError."""
     name, given = asked(options)
     if is_saved(folder):
         checkpoint = reopened(TopRewardCheckpoint, folder, options)
@@ -82,7 +82,7 @@ def _named_by_lerobot(content: Mapping[str, Any], options: CheckpointConfig) -> 
 
 
 def _settings(files: LanguageFolder, of_lerobot: Mapping[str, Any], options: CheckpointConfig) -> dict[str, Any]:
-    """Return the fields of TopRewardConfig that no file of a Qwen3-VL holds. Raises CheckpointError."""
+    """Return the fields of TopRewardConfig that no Qwen3-VL file holds. Raises CheckpointError."""
     name, given = asked(options)
     is_lerobot = name != ROBOMETER
     settings: dict[str, Any] = {
@@ -115,7 +115,7 @@ def _lerobot_settings(content: Mapping[str, Any], file: Path) -> dict[str, Any]:
 
 
 def _limits(files: LanguageFolder, *, is_lerobot: bool) -> dict[str, int]:
-    """Return the least and most pixels of a video by its processor. Raises CheckpointError."""
+    """Return a video's least and most pixels according to its processor. Raises CheckpointError."""
     sampling = {} if is_lerobot else {"do_sample_frames": True}  # LeRobot says which frames are shown
     try:
         preprocessor = read_preprocessor(files.processor, *OF_VIDEOS)
@@ -130,7 +130,7 @@ def _limits(files: LanguageFolder, *, is_lerobot: bool) -> dict[str, int]:
 
 
 def _check(settings: Mapping[str, Any]) -> None:
-    """Raise CheckpointError for settings that no prompt can be made of."""
+    """Raise CheckpointError for settings from which no prompt can be made."""
     prefixes, fps, suffix = settings["num_prefixes"], settings["fps"], settings["prompt_suffix"]
     if prefixes is not None and prefixes < 2:
         raise CheckpointError.at("num_prefixes", "at least 2, the first and the last", prefixes)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read a checkpoint's weights: from safetensors files, never pickles, without the name prefixes of training code."""
+"""Read a checkpoint's weights: from safetensors files, never pickles, without the name prefixes from training code."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-_PICKLE_STEM = "pytorch_model"  # of the names of transformers' pickled weights
-_ENCODERS = ("image_encoder", "text_encoder")  # subfolders of an exported checkpoint
-_LEVELS = ("*", "*/*", "*/*/*")  # depth of checkpoints in the folder of a training run or in a model repository
+_PICKLE_STEM = "pytorch_model"  # transformers' name for pickled weights
+_ENCODERS = ("image_encoder", "text_encoder")  # subfolders in an exported checkpoint
+_LEVELS = ("*", "*/*", "*/*/*")  # how deep checkpoints lie in a training run's folder or in a model repository
 _MAX_SUGGESTED = 5
 _PICKLES = ("*.bin", "*.pt", "*.pth", "*.ckpt", "*.pkl")
 # Files besides weights from which training resumes.
@@ -51,23 +51,23 @@ _CONVERT = (
     "for file in sys.argv[2:] for name, t in load(file).items() if torch.is_tensor(t)}, "
     "sys.argv[1], {'format': 'pt'})"
 )
-# Prefixes that training code puts before the names of weights. Those in _INSIDE also stand before names of layers.
+# Prefixes that training code puts before weight names. Those in _INSIDE also stand before layer names.
 _INSIDE = r"_orig_mod|_fsdp_wrapped_module|_checkpoint_wrapped_module|_forward_module"
 _WRAPPERS = re.compile(rf"^(?:(?:module|base_model\.model|{_INSIDE})\.)+|(?<=\.)(?:(?:{_INSIDE})\.)+")
 _HEAD = "progress_head.4.weight"  # in every reward network
-# The model_type of config.json, by the name of a weight that such a network has and no other.
+# config.json's model_type, by the name of a weight that only this network has.
 _NETWORKS = {
     "rewind_transformer": re.compile(r"(^|\.)video_proj\.weight$"),
     "qwen2_5_vl": re.compile(r"(^|\.)visual\.blocks\.\d+\.mlp\.gate_proj\."),
     "qwen3_vl": re.compile(r"(^|\.)visual\.blocks\.\d+\.mlp\.linear_fc1\."),
 }
-_PART = re.compile(r"_(text|vision)$")  # ends the model_type of a part
+_PART = re.compile(r"_(text|vision)$")  # ends a part's model_type
 
 
 def read_weights(folder: Path, model_type: str | None = None) -> dict[str, Tensor]:
-    """Return all tensors of model.safetensors, or of its shards, without the prefixes of wrappers.
+    """Return all tensors from model.safetensors, or its shards, without wrapper prefixes.
 
-    model_type: in config.json, of a network that contains one of the known networks; None: it is a known one
+    model_type: in config.json, for a network that contains a known network; None: the network itself is known
     Raises CheckpointError.
     """
     check_one_form(folder)
@@ -84,13 +84,13 @@ def read_weights(folder: Path, model_type: str | None = None) -> dict[str, Tenso
 
 
 def _check_network(folder: Path, names: Iterable[str], model_type: str | None) -> None:
-    """Raise CheckpointError if config.json is of another network than the weights, as some trainers write it."""
+    """Raise CheckpointError if config.json describes another network than the weights, as some trainers write it."""
     file, content = folder / NETWORK_CONFIG, network_config(folder)
     stated = content.get("model_type")
     found = next((kind for name in names for kind, own in _NETWORKS.items() if own.search(name)), None)
     is_first = stated is None and found == next(iter(_NETWORKS))  # the first ReWiND checkpoints state nothing
     is_expected = stated is not None and stated in (found, model_type)
-    if found is None or "type" in content or is_first or is_expected:  # ``type``: of LeRobot
+    if found is None or "type" in content or is_first or is_expected:  # ``type``: LeRobot's
         return
     if isinstance(stated, str) and _PART.sub("", stated) not in _NETWORKS:  # another network with some of the names
         got = f"{shown(stated)}, which is not supported"
@@ -127,9 +127,9 @@ def _read_shards(index: Path) -> dict[str, Tensor]:
 
 
 def _unwrapped(weights: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
-    """Remove the prefixes of DataParallel, torch.compile, PEFT and FSDP, and any prefix that all names share.
+    """Remove the prefixes from DataParallel, torch.compile, PEFT and FSDP, and any prefix that all names share.
 
-    folder: of the checkpoint, for messages
+    folder: checkpoint folder, for messages
     Raises CheckpointError if only some names have the prefix, or two names would be equal.
     """
     bare: dict[str, Tensor] = {}
@@ -167,12 +167,12 @@ def take_prefix(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 def has_head(weights: Iterable[str], head: str) -> bool:
-    """True if the weights contain any of this head's; ``check_shapes`` finds an incomplete head."""
+    """True if the weights contain any from this head; ``check_shapes`` finds an incomplete head."""
     return any(name.startswith(f"{head}_head.") for name in weights)
 
 
 def refuse_pickles(folder: Path, wanted: str, stem: str) -> None:
-    """Raise CheckpointError if ``folder`` has pickled weights in place of the missing file ``wanted``.
+    """Raise CheckpointError if ``folder`` has pickled weights instead of the missing file ``wanted``.
 
     Pickles are never opened, since that may run code. The message holds a command that converts them.
     stem: of transformers' names; if files with such names exist, other pickles do not count

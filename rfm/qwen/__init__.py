@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The Qwen backbones that five families share: images and videos, prompts, trees of prefixes, the pass, few bits."""
+"""The Qwen backbones that five families share: images, videos, prompts, prefix trees, the forward pass, rounding."""

@@ -2,16 +2,16 @@
 """The forward pass of the Qwen backbones, with the layers of ``transformers``, without synchronisation.
 
 The host computes all positions and indices beforehand and never waits for the device, so the device always has work.
-Results and order of sums are those of ``transformers`` 4.57.
+Results and summation order match ``transformers`` 4.57.
 
-Language model: B conversations of L tokens, D width, M visual tokens in all. A token has three coordinates: time, row
-and column. From one text token to the next, all three grow by 1. An image or video is a box, in which a token's
-coordinates are its place. The next text continues behind the box's largest coordinate. Padding follows the tokens,
-where causal attention does not see it. So no mask is needed, and PyTorch's fastest attention accepts none.
+Language model: B conversations, L tokens, width D, M visual tokens in total. A token has three coordinates: time, row
+and column. From one text token to the next, all three grow by 1. An image or video is a box, and a token's coordinates
+are its place in that box. The text behind a box continues after the box's largest coordinate. Padding follows the
+tokens, where causal attention cannot see it. This avoids a mask, which PyTorch's fastest attention does not accept.
 
-Vision tower: a shot is a temporal patch, an image or two frames of a video. Attention stays within a shot. N patches
-of all shots in order, those of a merged token together; S patches of a shot, U = MERGE x MERGE of a merged token.
-Shots of a size share a call; transformers computes them one after the other.
+Vision tower: a shot is a temporal patch, that is, an image or two video frames. Attention stays within a shot. There
+are N patches in all shots, S in one shot and U = MERGE x MERGE in one merged token; a merged token's patches are
+adjacent. Shots with equal sizes share a call; transformers computes them one by one.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class Box:
     """The merged tokens of an image or video in a conversation.
 
     start: index of the first token
-    groups: number of temporal patches
-    rows, columns: of merged tokens in each
+    groups: how many temporal patches there are
+    rows, columns: merged tokens per temporal patch
     step: difference in time coordinate between temporal patches
     """
 
@@ -51,12 +51,12 @@ class Box:
 
     @property
     def num_tokens(self) -> int:
-        """Number of tokens in the box."""
+        """How many tokens the box has."""
         return self.groups * self.rows * self.columns
 
 
 def positions(length: int, boxes: Sequence[Box]) -> npt.NDArray[np.int64]:
-    """Return time, row and column of each of ``length`` = L tokens, int64 [3, L]; ``boxes`` in order."""
+    """Return time, row and column of ``length`` = L tokens, int64 [3, L]; ``boxes`` in order."""
     found = np.empty((3, length), np.int64)
     read = following = 0  # tokens with positions so far; the next text token's coordinate
     for box in boxes:
@@ -80,12 +80,12 @@ Indices = npt.NDArray[np.int64]
 class VisionPlan:
     """The layout of a batch's shots for a vision tower.
 
-    shots: number of shots and S, for each size
-    positions: int64 [sum of S, 2], row and column of each patch, for a shot of each size
+    shots: shot count and S for every shot size
+    positions: int64 [sum of S, 2], row and column of the patches, one shot per size
     corners, weights: Qwen3-VL: int64 and float32 [4, sum of S], learned positions around these patches, their weights
-    windows: Qwen2.5-VL: runs of equal windows, as number of windows and patches of a window
-    order: Qwen2.5-VL: int64 [N / U], the merged tokens in the order of the windows
-    back: the inverse of ``order``
+    windows: Qwen2.5-VL: runs of equal windows, as window count and patches per window
+    order: Qwen2.5-VL: int64 [N / U], the merged tokens in window order
+    back: the inverse permutation of ``order``
     """
 
     shots: Runs
@@ -98,10 +98,10 @@ class VisionPlan:
 
 
 def plan(grids: Sequence[Grid], config: dict[str, Any]) -> VisionPlan:
-    """Return the plan for shots of these sizes, on the CPU.
+    """Return the plan for shots with these sizes, on the CPU.
 
-    grids: of each size, with its number of shots as ``groups``
-    config: vision_config of config.json
+    grids: one per size, where ``groups`` counts the shots
+    config: vision_config in config.json
     """
     sizes = [(grid.rows, grid.columns) for grid in grids]
     shots = tuple((grid.groups, grid.rows * grid.columns) for grid in grids)
@@ -118,11 +118,11 @@ def plan(grids: Sequence[Grid], config: dict[str, Any]) -> VisionPlan:
 
 
 def features(visual: Any, patches: Tensor, plan: VisionPlan) -> Tensor:
-    """Return the features of all merged tokens, [N / U, levels, D], of patches [N, C * T * P * P].
+    """Return the features of all merged tokens, [N / U, levels, D], from patches [N, C * T * P * P].
 
-    levels: 1, and in Qwen3-VL more from deeper layers
-    C = 3 channels, T = 2 frames, P pixels a side of a patch
-    visual: transformers' vision tower, of which only the layers are used
+    levels: 1; Qwen3-VL adds deeper layers
+    C = 3 channels, T = 2 frames, P: patch side in pixels
+    visual: transformers' vision tower; only its layers are used
     """
     hidden = embedded(visual.patch_embed.proj, patches)
     if plan.corners is not None:
@@ -147,7 +147,7 @@ def features(visual: Any, patches: Tensor, plan: VisionPlan) -> Tensor:
 def embedded(projection: Any, patches: Tensor) -> Tensor:
     """Embed patches with one matrix product: [N, C * T * P * P] -> [N, D].
 
-    ``projection`` is a Conv3d whose kernel equals its stride. Some versions of cuDNN compute this convolution wrong or
+    ``projection`` is a Conv3d whose kernel equals its stride. Some cuDNN versions compute this convolution wrongly or
     very slowly in bfloat16 (pytorch issue 163539, transformers issue 45750).
     """
     weight: Tensor = projection.weight
@@ -155,7 +155,7 @@ def embedded(projection: Any, patches: Tensor) -> Tensor:
 
 
 def _attention(attention: Any, hidden: Tensor, turned: Turn, plan: VisionPlan, *, is_full: bool) -> Tensor:
-    """Attend within each shot (``is_full``) or window, equal sizes in one call: [N, D] -> [N, D]."""
+    """Attend within shots (``is_full``) or windows, equal sizes in one call: [N, D] -> [N, D]."""
     heads = attention.qkv(hidden).unflatten(1, (3, attention.num_heads, -1))
     query, key = turned(heads[:, :2]).unbind(1)
     value = heads[:, 2]
@@ -170,7 +170,7 @@ def _attention(attention: Any, hidden: Tensor, turned: Turn, plan: VisionPlan, *
 
 
 def _within(run: tuple[int, int], query: Tensor, key: Tensor, value: Tensor, *, scale: float) -> Tensor:
-    """Attend within equal sequences, ``run`` = number and length: [N, heads, D / heads] -> [N, D]."""
+    """Attend within equal sequences, ``run`` = (count, length): [N, heads, D / heads] -> [N, D]."""
     query, key, value = (each.unflatten(0, run).transpose(1, 2) for each in (query, key, value))
     return F.scaled_dot_product_attention(query, key, value, scale=scale).transpose(1, 2).flatten(2).flatten(0, 1)
 
@@ -179,14 +179,14 @@ def _within(run: tuple[int, int], query: Tensor, key: Tensor, value: Tensor, *, 
 class Turn:
     """The rotary embedding: float32 [N, 1, 1, D / heads].
 
-    cosine, sine: of positions; the first half of the sines is negated, so queries and keys need no negation
+    cosine, sine: by position; the first half of the sines is negated, so queries and keys need no negation
     """
 
     cosine: Tensor
     sine: Tensor
 
     def __call__(self, heads: Tensor) -> Tensor:
-        """Rotate queries and keys, [N, 2, heads, D / heads], in float32; the result has their dtype."""
+        """Rotate queries and keys, [N, 2, heads, D / heads], in float32; the result keeps the input dtype."""
         first, second = heads.chunk(2, dim=-1)
         return (heads * self.cosine + torch.cat((second, first), dim=-1) * self.sine).to(heads.dtype)
 
@@ -211,7 +211,7 @@ def _learned_positions(embedding: Any, plan: VisionPlan) -> Tensor:
 
 
 def _repeated(of_sizes: Tensor, shots: Runs) -> Tensor:
-    """Repeat the values of a shot of each size for all its shots: [sum of S, ...] -> [N, ...]."""
+    """Repeat one shot's values for all shots with the same size: [sum of S, ...] -> [N, ...]."""
     parts = zip(of_sizes.split([length for _, length in shots]), shots, strict=True)
     return concatenated([part.repeat(count, *(1,) * (part.ndim - 1)) for part, (count, _) in parts])
 
@@ -223,7 +223,7 @@ def _moved(patches: Tensor, order: Tensor | None) -> Tensor:
 
 @lru_cache(maxsize=256)
 def _positions(rows: int, columns: int) -> Tensor:
-    """Return row and column of each patch, int64 [S, 2]."""
+    """Return the row and column of all patches in a shot, int64 [S, 2]."""
     indices = np.indices((rows, columns)).reshape(2, rows // MERGE, MERGE, columns // MERGE, MERGE)
     return torch.from_numpy(np.ascontiguousarray(indices.transpose(1, 3, 2, 4, 0).reshape(-1, 2)))
 
@@ -249,7 +249,7 @@ def _corners(rows: int, columns: int, side: int) -> tuple[Tensor, Tensor]:
 
 @lru_cache(maxsize=256)
 def _windows_of(rows: int, columns: int, side: int) -> dict[int, Indices]:
-    """Return a shot's merged tokens by window, int64 [windows, tokens], for each number of tokens in a window."""
+    """Return a shot's merged tokens by window, int64 [windows, tokens], keyed by tokens per window."""
     tokens = np.arange(rows * columns).reshape(rows, columns)
     found: dict[int, list[Indices]] = {}
     for top in range(0, rows, side):
@@ -260,7 +260,7 @@ def _windows_of(rows: int, columns: int, side: int) -> dict[int, Indices]:
 
 
 def _windows(grids: Sequence[Grid], side: int) -> tuple[Runs, Indices]:
-    """Return runs of windows (number, patches of each), and the merged tokens in the windows' order, int64 [N / U]."""
+    """Return window runs (count, patches per window) and the merged tokens in window order, int64 [N / U]."""
     runs, order, start = [], [], 0
     for grid in grids:
         for length, windows in _windows_of(grid.rows // MERGE, grid.columns // MERGE, side).items():
@@ -276,22 +276,22 @@ ROOM = 16  # slots that KeyValues adds at a time
 
 
 class KeyValues:
-    """The keys and values of all tokens so far, of each layer, in the form of transformers' cache.
+    """The keys and values of all tokens so far, layer by layer, with the interface of transformers' cache.
 
-    Each conversation has S slots and fills them from the first. After the pass over the prompts, call ``place`` before
-    the pass over each further token.
+    A conversation has S slots, filled from the first. After the pass over the prompts, call ``place`` before the pass
+    over each further token.
     """
 
     def __init__(self) -> None:
-        self._of_layers: dict[int, tuple[Tensor, Tensor]] = {}  # [B, S, heads, D / heads] each
-        self._next: Tensor | None = None  # int64 [B], the slots of the next tokens among all B * S
+        self._of_layers: dict[int, tuple[Tensor, Tensor]] = {}  # by layer: [B, S, heads, D / heads] twice
+        self._next: Tensor | None = None  # int64 [B], the next tokens' slots among all B * S
         self._num_seen = 0
 
     def place(self, lengths: Tensor, longest: int) -> None:
-        """Put the next token of each conversation behind its first tokens. Forget what was there.
+        """Put the next token of each conversation behind its first ``lengths`` tokens, and forget later ones.
 
-        lengths: int64 [B], number of tokens to keep
-        longest: the largest of them
+        lengths: int64 [B], how many tokens to keep
+        longest: the maximum of ``lengths``
         """
         self._num_seen = longest + 1
         if self._num_seen > self._of_layers[0][0].shape[1]:
@@ -301,9 +301,9 @@ class KeyValues:
         self._next = torch.arange(len(lengths), device=lengths.device) * num_slots + lengths
 
     def update(self, keys: Tensor, values: Tensor, layer: int, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
-        """Add the keys and values of new tokens, [B, heads, L, D / heads]; return those of all tokens.
+        """Add the keys and values of new tokens, [B, heads, L, D / heads], and return those of all tokens.
 
-        Behind a conversation's own tokens, the result has those of padding or of forgotten tokens, or zeros.
+        Behind a conversation's own tokens, the result holds padding, forgotten tokens or zeros.
         """
         new = keys.transpose(1, 2), values.transpose(1, 2)
         if self._next is None:
@@ -324,15 +324,15 @@ def _with_room(slots: Tensor) -> Tensor:
 
 
 class Part:
-    """Tokens that pass each layer together, and their hidden states so far.
+    """Tokens that pass each layer together, and their current hidden states.
 
     language: transformers' language model
-    inputs: on its device: input_ids, int64 [B, L]; position_ids, int64 [3, B, L]; with ``features`` visual_tokens,
-        int64 [M], the visual tokens' indices among all B * L, and visual_features, int64 [M], the index of each in
+    inputs: on its device: input_ids, int64 [B, L]; position_ids, int64 [3, B, L]; with ``features`` also visual_tokens,
+        int64 [M], the visual tokens' indices among all B * L, and visual_features, int64 [M], their indices in
         ``features``
-    features: [N / U, levels, D], the merged tokens of all shots; None: there is no visual token
-    key_values: transformers' cache, which receives the keys and values of these tokens; None: they are not needed
-    mask: returns the tokens that each token sees, or None if each sees those before it
+    features: [N / U, levels, D], the merged tokens of all shots; None: there are no visual tokens
+    key_values: transformers' cache that receives these tokens' keys and values; None: nothing is kept
+    mask: returns which tokens each token sees; None: the earlier ones
     """
 
     def __init__(
@@ -351,20 +351,20 @@ class Part:
             self.states.flatten(0, 1).index_copy_(0, self._at, merged[self._picked].to(self.states.dtype))
         self._turned = language.rotary_emb(self.states, inputs["position_ids"])
         known = inspect.signature(language.layers[0].forward).parameters
-        cache = "cache" if "cache" in known else "past_key_values"  # transformers changed the name in 5.x
+        cache = "cache" if "cache" in known else "past_key_values"  # transformers 5.x renamed the argument
         self._options = {} if key_values is None else {cache: key_values}
 
     def run(self, number: int, layer: Any) -> None:
-        """Pass the layer of this number."""
+        """Run layer ``number`` on the tokens."""
         states = layer(self.states, position_embeddings=self._turned, attention_mask=self._mask(), **self._options)
-        self.states = states[0] if isinstance(states, tuple) else states  # transformers 4.57 of Qwen2.5-VL
+        self.states = states[0] if isinstance(states, tuple) else states  # transformers 4.57 with Qwen2.5-VL
         if number < len(self._deeper):
             added = self._deeper[number][self._picked].to(self.states.dtype)
             self.states.flatten(0, 1).index_add_(0, self._at, added)
 
 
 def run_layers(language: Any, *parts: Part) -> Tensor:
-    """Pass all layers, each of which takes the parts in turn; return the states behind the final norm, [tokens, D]."""
+    """Run all layers on the parts in turn; return the states behind the final norm, [tokens, D]."""
     for number, layer in enumerate(language.layers):
         for part in parts:
             part.run(number, layer)
@@ -374,7 +374,7 @@ def run_layers(language: Any, *parts: Part) -> Tensor:
 def last_hidden_state(
     language: Any, inputs: dict[str, Tensor], features: Tensor, key_values: KeyValues | None = None
 ) -> Tensor:
-    """Return the hidden states behind the final norm, [B, L, D]. Parameters as of ``Part``."""
+    """Return the hidden states behind the final norm, [B, L, D]. ``Part`` describes the parameters."""
     return run_layers(language, Part(language, inputs, features, key_values)).unflatten(0, inputs["input_ids"].shape)
 
 
@@ -385,13 +385,13 @@ def next_hidden_state(
 
     tokens: int64 [B]
     position_ids: int64 [B], equal in time, row and column, since the token is text
-    lengths: int64 [B], number of tokens before
-    key_values: of the tokens before; receives those of this token, and forgets all others
+    lengths: int64 [B], how many tokens precede
+    key_values: holds the earlier tokens; receives this token and forgets all others
     """
     device = language.embed_tokens.weight.device
     ids, at, before = torch.from_numpy(np.stack([tokens, position_ids, lengths])).to(device)
     longest, is_seen = int(lengths.max()), None
-    if int(lengths.min()) < longest:  # else no mask: PyTorch's fastest attention takes none
+    if int(lengths.min()) < longest:  # otherwise no mask: PyTorch's fastest attention takes none
         is_seen = (torch.arange(longest + 1, device=device) <= before[:, None])[:, None, None]
     key_values.place(before, longest)
     inputs = {"input_ids": ids[:, None], "position_ids": at[None, :, None].expand(3, -1, -1)}

@@ -26,13 +26,13 @@ class VlmRow:
     """A conversation.
 
     input_ids: int64 [L]
-    videos: of each trajectory
-    spans: for each trajectory, the tokens (first, behind the last) whose states are read for each frame
+    videos: one per trajectory
+    spans: per trajectory and frame, the tokens (first, behind the last) whose states are read
     query: index of the token whose state gives preference or similarity; None: a single trajectory
     picked: in dense mode int64 [frame_steps], the frames in the conversation; None: all
     position_ids: int64 [3, L]
     packs: conversations about the same video that begin like this one, the trunk, and precede it (``rfm.qwen.tree``)
-    alone: all conversations of a row with packs, as rows
+    alone: for a row with packs, all its conversations as separate rows
     """
 
     input_ids: Indices
@@ -52,27 +52,27 @@ class VlmRow:
 
     @property
     def cost(self) -> int:
-        """Number of tokens that the language model computes: the conversation's, and those that its leaves add."""
+        """How many tokens the language model computes: this conversation and what its leaves add."""
         return self.num_tokens + sum(leaf.num_tokens for leaf in self.leaves)
 
     @property
     def shown(self) -> Iterator[tuple[VlmVideo, Indices]]:
-        """Each trajectory, and the indices of its frames in the conversation."""
+        """The trajectories with their frame indices in the conversation."""
         return ((video, np.arange(video.num_shown) if self.picked is None else self.picked) for video in self.videos)
 
     @property
     def num_tokens(self) -> int:
-        """L, the number of tokens in the conversation."""
+        """L, how many tokens the conversation has."""
         return len(self.input_ids)
 
 
 @dataclass(eq=False)
 class SizedShots:
-    """Shots of equal size for the vision tower.
+    """Shots with one size for the vision tower.
 
-    videos: frames of each video, uint8 [N, H', W', 3]
-    firsts: index of each video's first frame among those of all videos, by the id of its SizedFrames
-    shots: indices of a shot's frames among those of all videos, by key
+    videos: frames per video, uint8 [N, H', W', 3]
+    firsts: index of a video's first frame among all videos' frames, by the id of its SizedFrames
+    shots: indices of a shot's frames among all videos' frames, by key
     """
 
     videos: list[Tensor] = field(default_factory=list)
@@ -80,7 +80,7 @@ class SizedShots:
     shots: dict[Hashable, Shot] = field(default_factory=dict)
 
     def add(self, sized: SizedFrames, key: Hashable, shot: Shot) -> None:
-        """Add a shot of a video."""
+        """Add a video's shot."""
         if id(sized) not in self.firsts:
             self.firsts[id(sized)] = sum(map(len, self.videos))
             self.videos.append(sized.pixels)
@@ -90,16 +90,16 @@ class SizedShots:
         self.shots[key] = tuple(first + place for place in places)
 
     def frames(self) -> FramesOfOneSize:
-        """Return the videos, with the frames of each shot."""
+        """Return the videos and which frames form the shots."""
         shots = torch.tensor(list(self.shots.values()))
         is_each = torch.equal(shots, torch.arange(sum(map(len, self.videos)))[:, None])
         return FramesOfOneSize(self.videos, None if is_each else shots)
 
 
 class Shots:
-    """The different shots of a batch.
+    """The distinct shots in a batch.
 
-    are_images: each frame is a shot; else each pair
+    are_images: each frame is a shot; otherwise each pair
     """
 
     def __init__(self, *, are_images: bool) -> None:
@@ -111,11 +111,11 @@ class Shots:
 
     @property
     def sizes(self) -> list[SizedShots]:
-        """The uncached shots of each size, in the order of their addition."""
+        """The uncached shots by size, in the order in which they were added."""
         return list(self._of_size.values())
 
     def add(self, video: VlmVideo, shown: Indices) -> list[Hashable]:
-        """Add the shots of a conversation that shows these frames of a video; return their keys."""
+        """Add the shots in a conversation that shows these video frames; return their keys."""
         sized, keys = video.ready, []
         self._sized.append(sized)
         for shot in shots_of(shown, are_images=self._are_images):
@@ -127,7 +127,7 @@ class Shots:
         return keys
 
     def layout(self, tokens_per_shot: Sequence[int]) -> Layout:
-        """Return the layout of the shots' tokens. ``tokens_per_shot``: for each of ``sizes``."""
+        """Return the layout of the shots' tokens. ``tokens_per_shot`` follows ``sizes``."""
         made: dict[Hashable, slice] = {}
         start = 0
         for size, tokens in zip(self.sizes, tokens_per_shot, strict=True):
@@ -148,7 +148,7 @@ class FramesOfOneSize:
     """Frames of equal size, by video, and the shots that they form.
 
     videos: uint8 [T, H', W', 3] each
-    shots: frames of each of S shots, int64 [S, 1] for images, [S, 2] for videos; None: each frame is an image
+    shots: frame indices of S shots, int64 [S, 1] for images, [S, 2] for videos; None: each frame is an image
     """
 
     videos: Sequence[Tensor]
@@ -156,7 +156,7 @@ class FramesOfOneSize:
 
     @property
     def num_shown(self) -> int:
-        """Number of frames in the shots; a frame that fills up a pair counts twice."""
+        """How many frames the shots have; a frame that fills up a pair counts twice."""
         return sum(map(len, self.videos)) if self.shots is None else self.shots.numel()
 
     def frames(self, device: torch.device) -> Tensor:
@@ -166,23 +166,23 @@ class FramesOfOneSize:
 
 @dataclass(frozen=True)
 class QwenPixels:
-    """Pixels for the Qwen backbones: patches of images, or of pairs of frames, in the order of ``sizes``."""
+    """Pixels for the Qwen backbones: patches from images or frame pairs, in the order of ``sizes``."""
 
     images: QwenImages
     sizes: Sequence[FramesOfOneSize]
 
     @property
     def videos(self) -> list[Tensor]:
-        """The frames of each video, uint8 [T, H', W', 3]."""
+        """The frames by video, uint8 [T, H', W', 3]."""
         return [video for size in self.sizes for video in size.videos]
 
     @property
     def num_shown(self) -> int:
-        """Number of frames in all shots."""
+        """How many frames all shots have."""
         return sum(size.num_shown for size in self.sizes)
 
     def changed(self, change: Callable[[Tensor], Tensor]) -> QwenPixels:
-        """Return these pixels with ``change`` applied to the indices of the shots."""
+        """Return these pixels with ``change`` applied to the shots' indices."""
         shots = [None if size.shots is None else change(size.shots) for size in self.sizes]
         sizes = [replace(size, shots=made) for size, made in zip(self.sizes, shots, strict=True)]
         return replace(self, sizes=sizes)
@@ -194,10 +194,10 @@ class QwenPixels:
 
 
 class Layout:
-    """The indices of each shot's merged tokens: first those from the vision tower, by size, then those from the cache.
+    """The indices of the shots' merged tokens: those from the vision tower by size, then those from the cache.
 
-    made: indices for each shot that the tower reads
-    kept: features of each cached shot, [tokens, levels, D]
+    made: indices by shot, for shots that the tower reads
+    kept: features of cached shots, [tokens, levels, D]
     """
 
     def __init__(self, made: dict[Hashable, slice], kept: dict[Hashable, Tensor]) -> None:
@@ -208,7 +208,7 @@ class Layout:
             start += len(features)
 
     def tokens(self, keys: Sequence[Hashable]) -> Indices:
-        """Return the indices of the merged tokens of shots of equal size, in order, int64 [M]."""
+        """Return the indices of the merged tokens of equally large shots, in order, int64 [M]."""
         first = self._tokens[keys[0]]
         starts = np.array([self._tokens[key].start for key in keys], np.int64)
         tokens: Indices = (starts[:, None] + np.arange(first.stop - first.start)).ravel()
@@ -220,14 +220,14 @@ class VlmBatch:
     """Conversations, padded to the longest, with F frames (or temporal patches) and Q queries.
 
     inputs: the backbone's arguments by name
-    spans: int64 [F, 3], row, first token and token behind the last of each frame's state
-    query_rows, query_tokens: int64 [Q], row and token of each query
+    spans: int64 [F, 3], per frame the row, the first token and the token behind the last whose states are read
+    query_rows, query_tokens: int64 [Q], row and token of the queries
     num_tokens, num_span_tokens: tokens without padding; tokens in all spans
-    pixels: source of the arguments for pixels; None: these are in ``inputs``, or all shots are cached
-    plan: of the vision tower; None: all shots are cached
-    layout: of the shots; None: not placed yet
-    packs: of conversations that begin like others (``rfm.qwen.tree``). With packs, spans and queries have row 0 and
-        index all tokens: the B * L of the conversations, then those of the packs
+    pixels: source of the pixel arguments; None: these are in ``inputs``, or all shots are cached
+    plan: for the vision tower; None: all shots are cached
+    layout: where the shots' tokens lie; None: not placed yet
+    packs: conversations that begin like others (``rfm.qwen.tree``). With packs, spans and queries have row 0 and
+        index all tokens: the conversations' B * L, then those in the packs
     """
 
     inputs: dict[str, Tensor]
@@ -243,15 +243,15 @@ class VlmBatch:
 
     @property
     def num_slots(self) -> int:
-        """Number of tokens, with padding."""
+        """How many tokens there are, with padding."""
         return sum(ids.numel() for ids in (self.inputs["input_ids"], *(packs.input_ids for packs in self.packs)))
 
     def pinned(self) -> VlmBatch:
-        """Return the batch with its tensors, except the frames, in pinned memory."""
+        """Return the batch with all tensors except the frames in pinned memory."""
         return self._changed(pinned)
 
     def to(self, device: torch.device, dtype: torch.dtype) -> VlmBatch:
-        """Return the batch on ``device``, where pixels are normalised, put in order and converted to ``dtype``."""
+        """Return the batch on ``device``, where pixels are normalised, cut into patches and converted to ``dtype``."""
         moved = self._changed(lambda tensor: tensor.to(device, non_blocking=True))
         made = {} if moved.pixels is None else moved.pixels.inputs(device, dtype)
         return replace(moved, inputs=moved.inputs | made, pixels=None)

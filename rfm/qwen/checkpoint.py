@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What checkpoints on a Qwen backbone share: from weights in memory to a network, a predictor and files."""
+"""The base class for checkpoints on a Qwen backbone: from weights in memory to a network, a predictor and files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from rfm.saved import PROCESSOR_FOLDER, SETTINGS, write_network
 from rfm.weights import check_shapes
 from rfm_client.contract import Sample
 
-_VISION = "visual."  # beginning of parameters that patches pass
+_VISION = "visual."  # prefix of parameters that patches pass
 _EMBEDDING = "embed_tokens."  # looked up, not multiplied
 
 
@@ -39,9 +39,9 @@ _LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
 class QwenCheckpoint:
     """A checkpoint in memory.
 
-    weights: of its network, without LoRA
+    weights: for its network, without LoRA
     processor: folder or id with tokenizer and preprocessing
-    network_of, predictor_of: classes of the network and its predictor
+    network_of, predictor_of: the classes to build
     """
 
     network_of: ClassVar[Any]
@@ -58,15 +58,15 @@ class QwenCheckpoint:
 
     @cached_property
     def collator(self) -> Any:
-        """The collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
+        """The sample collator. Raises CheckpointError if the processor is missing or does not fit."""
         return self.load_collator()
 
     def load_collator(self) -> QwenCollator:
-        """Return the collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
+        """Return the sample collator. Raises CheckpointError if the processor is missing or does not fit."""
         raise NotImplementedError
 
     def network(self, dtype: torch.dtype) -> nn.Module:
-        """Return the network, with weights of no use."""
+        """Return the network, with uninitialised weights."""
         network: nn.Module = self.network_of(self.config, build_backbone(self.config, dtype))
         return network
 
@@ -80,13 +80,13 @@ class QwenCheckpoint:
         return {**weights}
 
     def saved_settings(self) -> dict[str, Any]:
-        """Return this project's fields of an exported config.json."""
+        """Return this project's fields for an exported config.json."""
         return {name: value for name, value in config_fields(self.config).items() if name != "backbone"}
 
     def flop(self, sample: Sample) -> float:
-        """Return the operations of a sample's products with weights: two for each parameter and each patch or token.
+        """Return how many operations a sample's products with weights take: two per parameter and patch or token.
 
-        The products of attention, about a tenth, and the heads are left out.
+        Leaves out attention products, about a tenth, and the heads.
         Raises CheckpointError, InvalidSampleError.
         """
         collator, config = self.collator, self.config
@@ -107,8 +107,8 @@ class QwenCheckpoint:
     ) -> QwenPredictor:
         """Return a predictor with the network on ``device``. Raises CheckpointError.
 
-        dtype: of the network; None: float32 on the CPU, else the checkpoint's own
-        cache: for features of frames; None: no cache
+        dtype: of the network; None: float32 on the CPU, otherwise the checkpoint's own
+        cache: stores frame features; None: no cache
         """
         self.collator  # noqa: B018  first, so that a missing file is reported before the network is built
         if dtype is None and device.type == "cpu":

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Turn samples of raw frames into rows, and rows into padded batches for a vision-language backbone.
 
-T frames, L tokens. A row is a conversation: its tokens, and the tokens whose hidden states are read for each frame and
-for the query.
-Making a row is cheap. Resizing its frames is not, and may be done before its batch is collated.
+T frames, L tokens. A row is a conversation plus the tokens whose hidden states are read for the frames and the query.
+Making a row is cheap. Resizing its frames is not, and may happen before its batch is collated.
 """
 
 from __future__ import annotations
@@ -30,19 +29,19 @@ from rfm.qwen.video import Indices, Shot, SizedFrames, VlmVideo
 from rfm_client.contract import InvalidSampleError, Sample, Trajectory
 
 KEPT_TEXTS = 256  # cached conversations; an RL loop repeats the same task
-MAX_KEPT_BYTES = 16_384  # of a conversation's text; a task and 128 frames have fewer. A byte is at most one token
-FRAME_BYTES = 64  # of a chat template's text for a frame, about
+MAX_KEPT_BYTES = 16_384  # per conversation text; a task and 128 frames have fewer. A byte is at most one token
+FRAME_BYTES = 64  # chat template text per frame, about
 
 
 class Visual(Enum):
-    """The parts of a chat template besides text, by their names in it."""
+    """The non-text parts of a chat template, by name."""
 
     IMAGE = "image"
     VIDEO = "video"
 
 
 class Chat:
-    """A base model's chat template and tokenizer, with a cache of the latest short conversations."""
+    """A base model's chat template and tokenizer, with a cache of recent short conversations."""
 
     def __init__(self, tokenizer: Any) -> None:
         self._tokenizer = tokenizer
@@ -75,13 +74,13 @@ def _num_bytes(text: str) -> int:
 
 SECONDS_PER_GROUP = 1  # upstream's value for videos of Qwen2.5-VL
 TOKENS_PER_SECOND = 4  # transformers' default for Qwen2.5-VL
-VIDEO_FPS = 1  # upstream's value for Qwen3-VL, whose prompt has the time of each temporal patch
+VIDEO_FPS = 1  # upstream's value for Qwen3-VL, whose prompt states the time for each temporal patch
 VISION_START, VISION_END = "<|vision_start|>", "<|vision_end|>"
 IMAGE_PAD, VIDEO_PAD = "<|image_pad|>", "<|video_pad|>"
 
 
 class QwenCollator:
-    """Turns samples into rows, and rows into batches, for Qwen2.5-VL and Qwen3-VL. A family gives its ``rows``.
+    """Turns samples into rows, and rows into batches, for Qwen2.5-VL and Qwen3-VL. A family implements ``rows``.
 
     Images and videos are pad tokens between vision start and end.
 
@@ -89,7 +88,7 @@ class QwenCollator:
     images: the backbone's preprocessing
     """
 
-    makes_trees: ClassVar[bool] = True  # of prefixes, whose common beginnings are computed once
+    makes_trees: ClassVar[bool] = True  # compute the shared beginnings of prefixes once
 
     def __init__(self, config: Any, tokenizer: Any, images: QwenImages) -> None:
         self.config = config
@@ -100,17 +99,17 @@ class QwenCollator:
 
     @property
     def frames_per_shot(self) -> int:
-        """Number of frames in a temporal patch."""
+        """How many frames a temporal patch has."""
         return 1 if self.config.multi_image else FRAMES_PER_GROUP
 
     def rows(self, sample: Sample) -> list[VlmRow]:
-        """Return the conversations of a sample. Raises InvalidSampleError if the checkpoint cannot score it."""
+        """Return a sample's conversations. Raises InvalidSampleError if the checkpoint cannot score the sample."""
         raise NotImplementedError
 
     def collate(self, rows: Sequence[VlmRow], length: int | None = None) -> VlmBatch:
-        """Return the batch of conversations of any kinds and lengths, whose frames have been resized.
+        """Return a batch of conversations, whatever their kinds and lengths, whose frames have been resized.
 
-        length: L, to which they are padded; None: the longest conversation's
+        length: L, the padded length; None: the longest conversation's
         """
         length = length or max(row.num_tokens for row in rows)
         pad = self.tokenizer.pad_token_id
@@ -151,7 +150,7 @@ class QwenCollator:
     ) -> SizedFrames:
         """Resize the frames of a video's shots for the backbone.
 
-        cache: frames of shots in it need no resizing; None: no cache
+        cache: frames whose shots it holds need no resizing; None: no cache
         threads: prepare the frames
         """
         keys: dict[Shot, Hashable]
@@ -171,13 +170,13 @@ class QwenCollator:
         return SizedFrames(pixels, places[alike], keys, kept)
 
     def shot_keys(self, video: VlmVideo) -> dict[Shot, Hashable]:
-        """Return each shot's key: its size and its frames' digests, on which alone the shot's features depend."""
+        """Return the shots' keys: size and frame digests, which alone determine a shot's features."""
         grid, digests = self.grid(video), video.digests
         shots = video.shots(are_images=self.config.multi_image)
         return {shot: (grid.rows, grid.columns, *(digests[frame] for frame in shot)) for shot in shots}
 
     def _to_size(self, video: VlmVideo, needed: Sequence[int]) -> Tensor:
-        """Resize some of a video's frames to uint8 [N, H', W', 3], each independent of the others. Thread-safe."""
+        """Resize the needed video frames independently to uint8 [N, H', W', 3]. Thread-safe."""
         frames = video.stack(needed)
         if self.config.multi_image:
             return self.images.images_to_size(frames)
@@ -189,26 +188,26 @@ class QwenCollator:
 
     @property
     def visual_pad(self) -> int:
-        """The token whose embedding a feature of vision replaces."""
+        """The token whose embedding is replaced by visual features."""
         return int(self.tokenizer.convert_tokens_to_ids(self._pad))
 
     def grid(self, video: VlmVideo) -> Grid:
-        """Return the grid of a conversation's frames of a video, as images or as a video."""
+        """Return the grid for the video frames that a conversation shows, as images or as a video."""
         if self.config.multi_image:
             return replace(self.images.image_grid(*video.size), groups=video.num_shown)
         return self.images.video_grid(*video.size, video.num_shown)
 
     def num_patches(self, video: VlmVideo) -> int:
-        """Return the number of patches of the longest conversation's frames."""
+        """Return how many patches the longest conversation's frames have."""
         grid = self.grid(video)
         return grid.groups * grid.rows * grid.columns
 
     def _around(self, *texts: str) -> tuple[str, ...]:
-        """Return the texts of a Qwen3-VL's video in its prompt's form, wrapped as a whole or bare."""
+        """Return a Qwen3-VL's video texts in its prompt's form, wrapped as a whole or bare."""
         return (VISION_START, *texts, VISION_END) if self.config.video_prompt == WRAPPED else texts
 
     def _position_ids(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> Indices:
-        """Return position ids: a box for each image or temporal patch of Qwen3-VL, or for a video of Qwen2.5-VL."""
+        """Return position ids: one box per image, per temporal patch (Qwen3-VL) or per video (Qwen2.5-VL)."""
         is_whole = not self.config.multi_image and self.config.family != QWEN3
         step = SECONDS_PER_GROUP * self.config.backbone["vision_config"].get("tokens_per_second", TOKENS_PER_SECOND)
         boxes, read, starts = [], 0, self._positions(ids, self._pad)
@@ -247,7 +246,7 @@ class QwenCollator:
     def _with_leaves(self, batch: VlmBatch, rows: Sequence[VlmRow], features: Callable[[Leaf], Indices]) -> VlmBatch:
         """Return the batch with all leaves, and with its spans and queries as indices among all tokens.
 
-        features: returns the indices of the features that a leaf's whole conversation shows
+        features: returns the feature indices that a leaf's whole conversation shows
         """
         packs = [PlacedPack(index, row.num_tokens, pack) for index, row in enumerate(rows) for pack in row.packs]
         made, first = [], dict[Leaf, int]()
@@ -274,7 +273,7 @@ class QwenCollator:
 
 
 def video_of(trajectory: Trajectory, frame_steps: int) -> VlmVideo:
-    """Return the video of a trajectory's frames. Raises InvalidSampleError for embeddings."""
+    """Return a trajectory's frames as a video. Raises InvalidSampleError for embeddings."""
     if trajectory.named is not None:
         digests, frames = zip(*trajectory.named, strict=True)
         return VlmVideo.of(frames, frame_steps, digests)
@@ -284,7 +283,7 @@ def video_of(trajectory: Trajectory, frame_steps: int) -> VlmVideo:
 
 
 def expanded(ids: Indices, pad: int, lengths: Sequence[int]) -> Indices:
-    """Repeat each ``pad`` token by ``lengths``, which is faster than to tokenise so many."""
+    """Repeat the ``pad`` tokens by ``lengths``, which is faster than tokenising the repeated text."""
     times = np.ones(len(ids), np.int64)
     at = np.flatnonzero(ids == pad)
     assert len(at) == len(lengths), "the chat template shows each image or video once"
@@ -293,7 +292,7 @@ def expanded(ids: Indices, pad: int, lengths: Sequence[int]) -> Indices:
 
 
 def group_times(num_groups: int) -> list[float]:
-    """Return the mean time of the frames of each temporal patch, in seconds, at VIDEO_FPS."""
+    """Return the mean frame time of every temporal patch, in seconds, at VIDEO_FPS."""
     frame_times = [
         [(group * FRAMES_PER_GROUP + frame) / VIDEO_FPS for frame in range(FRAMES_PER_GROUP)]
         for group in range(num_groups)
@@ -302,5 +301,5 @@ def group_times(num_groups: int) -> list[float]:
 
 
 def timed_groups(times_s: Sequence[float]) -> str:
-    """Return Qwen3-VL's text of a video: each temporal patch behind its time."""
+    """Return Qwen3-VL's text for a video: every temporal patch behind its time."""
     return "".join(f"<{time_s:.1f} seconds>{VISION_START}{VIDEO_PAD}{VISION_END}" for time_s in times_s)

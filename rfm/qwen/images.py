@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Turn raw frames into a vision-language backbone's pixels, with the same values as upstream's collator.
 
-T frames, H x W pixels (H' x W' after resizing), C = 3 channels, P pixels a side of a patch. A merged token stands for
+T frames, H x W pixels (H' x W' after resizing), C = 3 channels, P: patch side in pixels. A merged token stands for
 MERGE x MERGE patches.
-The CPU resizes each frame once, as uint8 (``..._to_size``). The device does the rest in float.
-Sources: the resizing rules of ``qwen-vl-utils`` 0.0.14, the patch order of ``transformers``' Qwen2-VL image
-processor. Neither torchvision nor this processor is needed.
+The CPU resizes frames once, as uint8 (``..._to_size``). The device does the rest in float.
+Sources: the resizing rules in ``qwen-vl-utils`` 0.0.14, the patch order in ``transformers``' Qwen2-VL image processor.
+Neither torchvision nor this processor is needed.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array
 
 MERGE = 2
-FRAMES_PER_GROUP = 2  # frames of a video's temporal patch
-IMAGE_TOKENS = (4, 16_384)  # merged tokens of an image: least, most
-VIDEO_TOKENS = (128.0, 768.0)  # of a frame of a video
-VIDEO_TOTAL_TOKENS = 128_000 * 0.9  # of a whole video
+FRAMES_PER_GROUP = 2  # frames per temporal patch in a video
+IMAGE_TOKENS = (4, 16_384)  # merged tokens per image: least, most
+VIDEO_TOKENS = (128.0, 768.0)  # per video frame
+VIDEO_TOTAL_TOKENS = 128_000 * 0.9  # per video
 MAX_QWEN_ASPECT_RATIO = 200
 _NOT_LONG = f"an image at most {MAX_QWEN_ASPECT_RATIO} times as long as wide"
-MAX_VIDEO_SIDE_PX = 480  # larger frames of videos are scaled down first
+MAX_VIDEO_SIDE_PX = 480  # larger video frames are scaled down first
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Number of temporal patches, and rows and columns of patches in each, of an image or video."""
+    """How many temporal patches an image or video has, and how many rows and columns of patches are in one."""
 
     groups: int
     rows: int
@@ -46,22 +46,22 @@ class Grid:
 
     @property
     def tokens_per_group(self) -> int:
-        """Merged tokens of a temporal patch."""
+        """Merged tokens per temporal patch."""
         return self.rows * self.columns // MERGE**2
 
 
 def check_aspect(height: int, width: int) -> None:
-    """Raise InvalidSampleError for an image over 200 times as long as wide."""
+    """Raise InvalidSampleError for an image whose sides have a ratio over 200."""
     is_fit = max(height, width) / min(height, width) <= MAX_QWEN_ASPECT_RATIO
     require("frames", is_fit, _NOT_LONG, f"{height} x {width}", InvalidSampleError)
 
 
 def fitted_size(height: int, width: int, factor: int, tokens: tuple[float, float] = IMAGE_TOKENS) -> tuple[int, int]:
-    """Return the nearest height and width in multiples of ``factor``, of similar shape, for a Qwen backbone.
+    """Return the nearest height and width in multiples of ``factor``, with a similar shape, for a Qwen backbone.
 
-    factor: pixels a side of a merged token
+    factor: a merged token's side in pixels
     tokens: least and most merged tokens
-    Raises InvalidSampleError for an image over 200 times as long as wide.
+    Raises InvalidSampleError for an image whose sides have a ratio over 200.
     """
     check_aspect(height, width)
     least, most = (count * factor**2 for count in tokens)
@@ -80,10 +80,10 @@ def bounded_size(
 ) -> tuple[int, int]:
     """Return height and width as transformers' processors resize frames: in multiples of ``factor``, within bounds.
 
-    factor: pixels a side of a merged token
-    bounds_px: least and most pixels of all frames
-    num_filled: number of frames with those that fill up the last temporal patch
-    Raises InvalidSampleError for an image over 200 times as long as wide.
+    factor: a merged token's side in pixels
+    bounds_px: least and most pixels in all frames together
+    num_filled: frame count after the last temporal patch is filled up
+    Raises InvalidSampleError for an image whose sides have a ratio over 200.
     """
     check_aspect(height, width)
     least, most = bounds_px
@@ -113,8 +113,8 @@ class QwenImages:
     """Image preprocessing for the Qwen backbones.
 
     patch_px: P
-    size_px: height and width in the training run's settings; None: each frame's own
-    max_video_side_px: larger frames of videos are scaled down to it first; None: they are not
+    size_px: height and width in the training run's settings; None: keep the frame's own
+    max_video_side_px: scale larger video frames down to this side first; None: don't
     """
 
     patch_px: int
@@ -123,15 +123,15 @@ class QwenImages:
     max_video_side_px: int | None = MAX_VIDEO_SIDE_PX
 
     def to_config(self) -> dict[str, Any]:
-        """Return the corresponding fields of preprocessor_config.json."""
+        """Return the corresponding fields for preprocessor_config.json."""
         return {"patch_size": self.patch_px, **self.normalisation.to_config()}
 
     def image_grid(self, height: int, width: int) -> Grid:
-        """Return the grid of a frame [H, W, 3] as an image."""
+        """Return the grid for a frame [H, W, 3] as an image."""
         return self.grid(1, *self._image_size(height, width))
 
     def video_grid(self, height: int, width: int, num_shown: int) -> Grid:
-        """Return the grid of a video of ``num_shown`` frames [H, W, 3]."""
+        """Return the grid for a video with ``num_shown`` frames [H, W, 3]."""
         groups = math.ceil(num_shown / FRAMES_PER_GROUP)
         return self.grid(groups, *self._video_sizes(height, width, num_shown)[-1])
 
@@ -140,15 +140,15 @@ class QwenImages:
         return _to_sizes(frames, [self._image_size(frames.shape[1], frames.shape[2])])
 
     def video_to_size(self, frames: UInt8Array, num_shown: int) -> Tensor:
-        """Resize frames for a video of ``num_shown`` frames: uint8 [T, H, W, 3] -> [T, H', W', 3]."""
+        """Resize frames for a video with ``num_shown`` frames: uint8 [T, H, W, 3] -> [T, H', W', 3]."""
         *first_sizes, last_size = self._video_sizes(frames.shape[1], frames.shape[2], num_shown)
         return scaled_video(_to_sizes(frames, first_sizes), last_size)
 
     def patches(self, frames: Tensor, shots: Tensor | None, dtype: torch.dtype = torch.float32) -> Tensor:
         """Cut frames into N patches: uint8 [T, H', W', 3] -> [N, C * FRAMES_PER_GROUP * P * P].
 
-        Patches of a merged token are next to each other.
-        shots: frames of each of S temporal patches: int64 [S, 1] for images, [S, FRAMES_PER_GROUP] for videos; None:
+        A merged token's patches are adjacent.
+        shots: frame indices of S temporal patches: int64 [S, 1] for images, [S, FRAMES_PER_GROUP] for videos; None:
             each frame is an image
         """
         planes = self.normalisation(frames).to(dtype)
@@ -167,7 +167,7 @@ class QwenImages:
         return fitted_size(*(self.size_px or (height, width)), self.patch_px * MERGE)
 
     def _video_sizes(self, height: int, width: int, num_shown: int) -> list[tuple[int, int]]:
-        """Return the heights and widths to which frames of a video of ``num_shown`` are resized in turn."""
+        """Return the successive sizes to which the frames of a ``num_shown``-frame video are resized."""
         factor = self.patch_px * MERGE
         sizes = []
         fitted_size(height, width, factor)  # refuses narrow frames, which scaling down would leave without pixels
@@ -186,13 +186,13 @@ class QwenImages:
         return [*sizes, fitted_size(*sizes[-1], factor, (least, most_px / factor**2))]
 
     def grid(self, groups: int, height: int, width: int) -> Grid:
-        """Return the grid of ``groups`` temporal patches of this size in pixels."""
+        """Return the grid for ``groups`` temporal patches with this size in pixels."""
         return Grid(groups, height // self.patch_px, width // self.patch_px)
 
 
 @dataclass(frozen=True)
 class BoundedImages(QwenImages):
-    """The preprocessing of separate images by transformers' processor: each within a number of pixels."""
+    """The preprocessing that transformers' processor applies to separate images: pixel counts stay within limits."""
 
     least_px: int = field(kw_only=True)
     most_px: int = field(kw_only=True)
@@ -229,7 +229,7 @@ def scaled_in_integers(video: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _to_sizes(frames: UInt8Array, sizes: Sequence[tuple[int, int]]) -> Tensor:
-    """Resize frames to each of ``sizes`` in turn: uint8 [T, H, W, 3] -> [T, *sizes[-1], 3]."""
+    """Resize frames to all ``sizes`` in turn: uint8 [T, H, W, 3] -> [T, *sizes[-1], 3]."""
     if frames.flags.writeable and all(size == frames.shape[1:3] for size in sizes):
         return torch.from_numpy(frames)
     sized = np.empty((len(frames), *sizes[-1], frames.shape[-1]), np.uint8)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""An ordinary Qwen-VL with its language head, for reward models that are asked in words.
+"""An ordinary Qwen-VL with its language head, for reward models that are prompted in words.
 
-B conversations of L tokens, D width, V rows of the language head, Q queries: tokens whose successor is asked for.
+B conversations, L tokens, width D, V rows in the language head, Q queries: tokens whose successor is predicted.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-VIDEO = VISION_START + VIDEO_PAD + VISION_END  # a video, or a temporal patch, in the text of a prompt
+VIDEO = VISION_START + VIDEO_PAD + VISION_END  # a video, or a temporal patch, in a prompt's text
 HEAD, EMBEDDING = "lm_head.weight", "model.language_model.embed_tokens.weight"
-MOST_PIECES = 4096  # cached texts of a prompt and of times
+MOST_PIECES = 4096  # cached prompt and time texts
 
 
 @dataclass(frozen=True)
 class LanguageConfig(BackboneConfig):
-    """The configuration of a Qwen3-VL that is asked in words.
+    """The configuration of a Qwen3-VL that is prompted in words.
 
     base_model_id: source of the network, its tokenizer and processor
     """
@@ -63,7 +63,7 @@ class LanguageConfig(BackboneConfig):
 
     @classmethod
     def of(cls, saved: Saved) -> Self:
-        """Return the configuration in an export. Raises CheckpointError for an export of another reward model."""
+        """Return the configuration in an export. Raises CheckpointError for another reward model's export."""
         file = saved.folder / NETWORK_CONFIG
         fields = {name: tuple(each) if isinstance(each, list) else each for name, each in saved.settings.items()}
         name = fields.pop(REWARD_MODEL, None)
@@ -74,13 +74,13 @@ class LanguageConfig(BackboneConfig):
 
     @classmethod
     def fields_of(cls, settings: dict[str, Any]) -> dict[str, Any]:
-        """Return the fields of this class from an export's settings."""
+        """Return this class's fields from an export's settings."""
         return settings
 
 
 @dataclass(frozen=True)
 class LanguageOutput:
-    """Logits of the token behind each query, [Q, V], and the features that the vision tower computed."""
+    """Logits for the token behind each query, [Q, V], and the features that the vision tower computed."""
 
     logits: Tensor
     made: Tensor | None
@@ -98,7 +98,7 @@ class LanguageNetwork(nn.Module):
         self.lm_head = nn.Linear(config.hidden_dim, config.backbone["text_config"]["vocab_size"], bias=False)
 
     def forward(self, batch: VlmBatch, key_values: KeyValues | None = None) -> LanguageOutput:
-        """Return the logits of the token behind each query of a batch, which is on the network's device.
+        """Return the logits for the token behind each query in a batch on the network's device.
 
         key_values: receives the keys and values of all tokens
         """
@@ -107,7 +107,7 @@ class LanguageNetwork(nn.Module):
 
 
 class LanguageCollator(QwenCollator):
-    """The collator of prompts with one video, each temporal patch behind its time."""
+    """The collator for prompts with one video, every temporal patch behind its time."""
 
     def __init__(self, config: Any, tokenizer: Any, images: QwenImages) -> None:
         super().__init__(config, tokenizer, images)
@@ -120,11 +120,11 @@ class LanguageCollator(QwenCollator):
             raise CheckpointError.at("chat template", "one video in a prompt", num_videos)
 
     def example(self) -> str:
-        """Return the prompt of an example task, with VIDEO in the place of the video."""
+        """Return the prompt for an example task, with VIDEO as placeholder."""
         raise NotImplementedError
 
     def rows(self, sample: Sample) -> list[VlmRow]:
-        """Return the conversations of a progress sample. Raises InvalidSampleError."""
+        """Return the conversations for a progress sample. Raises InvalidSampleError."""
         check_type(sample, self.config)
         assert isinstance(sample, ProgressSample)  # by check_type
         (trajectory,) = sample.trajectories
@@ -138,16 +138,16 @@ class LanguageCollator(QwenCollator):
     def row(
         self, video: VlmVideo, text: str, shown: Indices, times_s: Sequence[float], more: Indices | tuple[int, ...] = ()
     ) -> VlmRow:
-        """Return the conversation in which a video stands at VIDEO in ``text``.
+        """Return the conversation in which a video replaces VIDEO in ``text``.
 
         shown: indices of its frames, int64
-        times_s: of each temporal patch
+        times_s: one per temporal patch
         more: tokens behind the text
         """
         grid = self.grid(video)
         before, _, behind = text.partition(VIDEO)
         first, *others = self._around(*(timed_groups([time_s]) for time_s in times_s))
-        # All pieces but the last end with a special token, so each alone has the same tokens as in the text.
+        # All pieces but the last end with a special token, so tokenising them separately gives the text's own tokens.
         pieces = [before + first, *others, behind]
         tokens = np.concatenate([*map(self._piece, pieces), more]).astype(np.int64)
         pad = self.tokenizer.convert_tokens_to_ids(VIDEO_PAD)
@@ -158,7 +158,7 @@ class LanguageCollator(QwenCollator):
         return VlmRow(ids, (video,), ([],), len(ids) - 1, False, picked=shown, position_ids=positions(len(ids), boxes))
 
     def template(self, *content: str, add_generation_prompt: bool) -> str:
-        """Return the chat template's text of one user message: the video, then ``content``."""
+        """Return the chat template's text for one user message: the video, then ``content``."""
         parts = [{"type": "video"}, *({"type": "text", "text": text} for text in content)]
         return str(
             self.tokenizer.apply_chat_template(
@@ -169,20 +169,20 @@ class LanguageCollator(QwenCollator):
 
 @dataclass(frozen=True)
 class LanguageCheckpoint(QwenCheckpoint):
-    """A Qwen3-VL in memory that is asked in words.
+    """A Qwen3-VL in memory that is prompted in words.
 
-    weights: of LanguageNetwork; the head's only if it is not tied to the embedding
-    made_of: class of the configuration
+    weights: for LanguageNetwork; with the head only if it is not tied to the embedding
+    made_of: the configuration class
     """
 
     made_of: ClassVar[type[LanguageConfig]]
     network_of: ClassVar[Any] = LanguageNetwork
-    reads_videos: ClassVar[bool] = True  # else separate images
+    reads_videos: ClassVar[bool] = True  # otherwise separate images
     has_language_head: ClassVar[bool] = True
 
     @property
     def own_tokens(self) -> dict[str, int]:
-        """The ids of tokens that an ordinary Qwen3-VL lacks, by token."""
+        """Tokens that an ordinary Qwen3-VL lacks, with their ids."""
         return {}
 
     @classmethod
@@ -194,7 +194,7 @@ class LanguageCheckpoint(QwenCheckpoint):
         return checkpoint
 
     def load_collator(self) -> LanguageCollator:
-        """Return the collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
+        """Return the sample collator. Raises CheckpointError if the processor is missing or does not fit."""
         tokenizer, preprocessor = read_processor(self.processor, videos=self.reads_videos)
         num_rows = self.config.backbone["text_config"]["vocab_size"]
         if len(tokenizer) > num_rows:
@@ -202,7 +202,7 @@ class LanguageCheckpoint(QwenCheckpoint):
             raise CheckpointError.at(f"base model {self.processor}", expected, len(tokenizer))
         check_tokens(self.config, tokenizer, self.processor, self.own_tokens)
         where = f"base model {self.processor}: preprocessing of {'videos' if self.reads_videos else 'images'}"
-        if not self.reads_videos:  # ``pixel_limits`` reads these of images
+        if not self.reads_videos:  # for images, ``pixel_limits`` reads these
             preprocessor = {**preprocessor, "min_pixels": None, "max_pixels": None}
         normalisation = normalisation_of(preprocessor, SIZED_BY_PROCESSOR, where)
         patch = patch_px(preprocessor, self.config.backbone["vision_config"], where)
@@ -216,7 +216,7 @@ class LanguageCheckpoint(QwenCheckpoint):
         return {**weights, **({HEAD: weights[EMBEDDING]} if is_tied else {})}
 
     def saved_settings(self) -> dict[str, Any]:
-        """Return this project's fields of an exported config.json."""
+        """Return this project's fields for an exported config.json."""
         return {REWARD_MODEL: self.config.reward_model, **super().saved_settings()}
 
     def build(self, dtype: torch.dtype | None = None) -> Any:

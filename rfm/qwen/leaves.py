@@ -2,9 +2,9 @@
 """Conversations that begin like another one: they reuse its shared tokens and add only the others.
 
 The longest conversation is the trunk. A causal language model gives equal states to equal beginnings, so a leaf needs
-only the tokens behind the shared ones. Leaves lie behind each other in packs, which share calls of the layers.
+only the tokens behind the shared ones. Packs hold consecutive leaves and share layer calls.
 
-L tokens of a trunk, R packs in a call, P tokens of the longest, N levels of the leaves that a token sees.
+L tokens in a trunk, R packs in a call, P tokens in the longest, N leaf levels that a token sees.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ import torch
 from torch import Tensor
 
 Indices = npt.NDArray[np.int64]
-MOST_PACK_TOKENS = 8192  # in a call, with padding
-MOST_MASK_BYTES = 64 * 2**20  # of the mask of a call: one for each pair of a token and a token that it may see
+MOST_PACK_TOKENS = 8192  # per call, with padding
+MOST_MASK_BYTES = 64 * 2**20  # per mask: one byte for each pair (token, token that it may see)
 
 
 @dataclass(frozen=True, eq=False)
 class Leaf:
-    """The tokens of a conversation behind those that it takes from the trunk and from other leaves of its pack.
+    """The tokens that a conversation adds behind those from the trunk and from other leaves in its pack.
 
-    from_trunk: number of first tokens of the trunk that it begins with
-    from_leaves: index in the pack, and number of first tokens, of each leaf that follows
+    from_trunk: how many of the trunk's first tokens the leaf begins with
+    from_leaves: index in the pack and token count, for each leaf whose first tokens follow
     input_ids: int64 [P], its tokens
     position_ids: int64 [3, P]
     shown: int64, the frames in the whole conversation
     reads: the tokens among the P (first, behind the last) whose states are read
-    is_mutual: its tokens see each other in both directions; else each sees those before it
+    is_mutual: its tokens see each other in both directions; otherwise only earlier ones
     """
 
     from_trunk: int
@@ -45,27 +45,27 @@ class Leaf:
 
     @property
     def num_tokens(self) -> int:
-        """P, the number of tokens that the leaf adds."""
+        """P, how many tokens the leaf adds."""
         return len(self.input_ids)
 
 
 def fits(num_tokens: int, num_trunk_tokens: int) -> bool:
-    """Return True if a pack of ``num_tokens`` behind a trunk keeps both bounds."""
+    """Return True if a pack of ``num_tokens`` behind a trunk stays within both limits."""
     return num_tokens <= MOST_PACK_TOKENS and num_tokens * (num_trunk_tokens + num_tokens) <= MOST_MASK_BYTES
 
 
 @dataclass(frozen=True)
 class Packs:
-    """Packs of one call, padded behind their tokens.
+    """The packs in one call, padded behind their tokens.
 
-    trunks: int64 [R], index of each pack's trunk in the batch
-    num_keys: tokens of the longest of these trunks
+    trunks: int64 [R], the packs' trunks as indices in the batch
+    num_keys: tokens in the longest of these trunks
     input_ids: int64 [R, P]
     position_ids: int64 [3, R, P]
-    visual_tokens, visual_features: as of ``rfm.qwen.backbone.Part``
-    from_trunk: int64 [R, P], number of the trunk's tokens that a token sees
-    leaves, places: int64 [R, P], the leaf of each token, and its place in it; -1 and 0 for padding
-    seen, upto: int64 [N, R, P], leaves that a token sees, its own first, and how many tokens of each
+    visual_tokens, visual_features: as in ``rfm.qwen.backbone.Part``
+    from_trunk: int64 [R, P], how many trunk tokens a token sees
+    leaves, places: int64 [R, P], a token's leaf and its place there; -1 and 0 for padding
+    seen, upto: int64 [N, R, P], leaves that a token sees, its own first, and how many tokens in each
     """
 
     trunks: Tensor
@@ -82,11 +82,11 @@ class Packs:
 
     @property
     def inputs(self) -> dict[str, Tensor]:
-        """The arguments of a language model, by the names of a batch."""
+        """The arguments for a language model, under the names that a batch uses."""
         return {name: getattr(self, name) for name in ("input_ids", "position_ids", "visual_tokens", "visual_features")}
 
     def mask(self) -> Tensor:
-        """Return the tokens of trunk and pack that each token sees, bool [R, 1, P, num_keys + P]."""
+        """Return which trunk and pack tokens each token sees, bool [R, 1, P, num_keys + P]."""
         keys = torch.arange(self.num_keys, device=self.from_trunk.device)
         own = torch.zeros_like(self.leaves[:, None] == self.leaves[..., None])
         for leaf, upto in zip(self.seen, self.upto, strict=True):
@@ -96,7 +96,7 @@ class Packs:
 
 @dataclass(frozen=True)
 class PlacedPack:
-    """A pack of a trunk. trunk: index in the batch; num_keys: tokens of the trunk"""
+    """A trunk's pack. trunk: index in the batch; num_keys: tokens in the trunk."""
 
     trunk: int
     num_keys: int
@@ -104,12 +104,12 @@ class PlacedPack:
 
     @property
     def num_tokens(self) -> int:
-        """Number of tokens in the pack."""
+        """How many tokens the pack has."""
         return sum(leaf.num_tokens for leaf in self.leaves)
 
 
 def calls(packs: Sequence[PlacedPack]) -> Iterator[list[PlacedPack]]:
-    """Yield the packs of each call: similar in length, within the bounds with their padding."""
+    """Yield the packs for each call: similar in length, within the limits with their padding."""
     part: list[PlacedPack] = []
     for pack in sorted(packs, key=lambda pack: pack.num_tokens):
         count = (len(part) + 1) * pack.num_tokens
@@ -124,10 +124,10 @@ def calls(packs: Sequence[PlacedPack]) -> Iterator[list[PlacedPack]]:
 
 
 def padded(packs: Sequence[PlacedPack], pad: int, visual_pad: int, features: Callable[[Leaf], Indices]) -> Packs:
-    """Return the packs of one call.
+    """Return the packs for one call.
 
-    pad, visual_pad: the tokens of padding, and of vision
-    features: returns the indices of the features that a whole conversation shows, int64
+    pad, visual_pad: the padding token, the vision token
+    features: returns the feature indices that a whole conversation shows, int64
     """
     longest, levels = max(pack.num_tokens for pack in packs), 1
     levels += max(len(leaf.from_leaves) for pack in packs for leaf in pack.leaves)
@@ -157,7 +157,7 @@ def padded(packs: Sequence[PlacedPack], pad: int, visual_pad: int, features: Cal
 
 
 def starts(packs: Sequence[PlacedPack]) -> dict[Leaf, int]:
-    """Return the index of each leaf's first token among all R * P tokens of a call."""
+    """Return the index of each leaf's first token among a call's R * P tokens."""
     longest = max(pack.num_tokens for pack in packs)
     found = {}
     for row, pack in enumerate(packs):

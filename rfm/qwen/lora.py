@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """LoRA: a weight is W + alpha / r * B A (https://arxiv.org/abs/2106.09685); adapters in PEFT's format.
 
-W and the factors stay separate until the dtype of the network is known. W is usually bfloat16, and many updates are
-smaller than half a step of bfloat16. A sum in bfloat16 would lose them, even for a network in float32.
+W and the factors stay separate until the network's dtype is known. W is usually bfloat16, and many updates are smaller
+than half a bfloat16 step. A sum in bfloat16 would lose them, even for a float32 network.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def module_of(factor: str) -> str:
 
 
 def merged(weights: Mapping[str, Tensor], factors: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
-    """Return the weights in ``dtype``, with B A of the factors added in float32; factors of rounded weights stay."""
+    """Return the weights in ``dtype``, with B A added in float32; rounded weights keep their factors separate."""
     whole = {}
     for name, weight in weights.items():
         module = name.removesuffix(".weight")

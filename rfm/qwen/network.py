@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""A Qwen backbone of ``transformers``: its configuration, and its pass over a batch.
+"""A Qwen backbone from ``transformers``: its configuration, and its pass over a batch.
 
-The vision tower and the language model become CUDA graphs: both depend on tensors and on the constants of the plan
-alone, and wait for nothing on the host. Trunks and leaves: each layer computes the trunks, keeps their keys and values,
-and then computes every call of packs, whose tokens see them. So memory holds the keys and values of one layer. B trunks
-of L tokens, D width.
+The vision tower and the language model become CUDA graphs: both depend only on tensors and on the plan's constants, and
+never wait for the host. Trunks and leaves: each layer computes the trunks, keeps their keys and values, and then
+computes every pack call, whose tokens see them. So memory holds the keys and values of only one layer. B trunks, L
+tokens, width D.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class BackboneConfig:
     backbone: transformers' configuration (config.json)
     dtype: number type of the network on a GPU
     video_prompt: form of a Qwen3-VL's prompt with a video (``rfm.published.qwen``)
-    weights: form of rounded layers (``rfm.qwen.rounded``); None: not rounded
+    weights: number format for rounded layers (``rfm.qwen.rounded``); None: not rounded
     """
 
     backbone: dict[str, Any]
@@ -59,7 +59,7 @@ class BackboneConfig:
 
     @property
     def family(self) -> str:
-        """The backbone's model_type, a key of BACKBONES."""
+        """The backbone's model_type, a key in BACKBONES."""
         return str(self.backbone["model_type"])
 
     @property
@@ -145,36 +145,36 @@ def graphed_hidden_state(graphs: Graphs, language: Any, inputs: dict[str, Tensor
 
 
 class TrunkKeyValues:
-    """The keys and values of a layer's trunks, in the form of transformers' cache."""
+    """The keys and values of one layer's trunks, with the interface of transformers' cache."""
 
     of_trunks: tuple[Tensor, ...] = ()
 
     def update(self, keys: Tensor, values: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
-        """Keep the keys and values of the trunks, [B, heads, L, D / heads], and return them."""
+        """Keep the trunks' keys and values, [B, heads, L, D / heads], and return them."""
         self.of_trunks = keys, values
         return keys, values
 
 
 @dataclass(frozen=True)
 class PackKeyValues:
-    """The keys and values that the tokens of a call may see, in the form of transformers' cache."""
+    """The keys and values that tokens in a call may see, with the interface of transformers' cache."""
 
     trunks: TrunkKeyValues
     packs: Packs
 
     def update(self, keys: Tensor, values: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
-        """Return the keys and values of each pack behind those of its trunk."""
+        """Return the packs' keys and values behind those of their trunks."""
         before = [each[self.packs.trunks, :, : self.packs.num_keys] for each in self.trunks.of_trunks]
         return torch.cat([before[0], keys], dim=2), torch.cat([before[1], values], dim=2)
 
 
 def tree_hidden_states(language: Any, inputs: dict[str, Tensor], packs: Sequence[Packs], features: Tensor) -> Tensor:
-    """Return the hidden states behind the final norm, of the trunks and then of each call, [1, all tokens, D].
+    """Return the hidden states behind the final norm, trunks first, then call by call, [1, all tokens, D].
 
-    language, inputs, features: as of ``rfm.qwen.backbone.Part``, of the trunks
+    language, inputs, features: the trunks' arguments for ``rfm.qwen.backbone.Part``
     """
     trunks, is_kept = TrunkKeyValues(), len(packs) == 1
-    # The mask of a single call is kept; those of several are made anew for each layer, so that memory holds one.
+    # Keep the mask for a single call. Rebuild several masks in each layer, so that memory holds one.
     calls = [
         Part(language, each.inputs, features, PackKeyValues(trunks, each), cache(each.mask) if is_kept else each.mask)
         for each in packs

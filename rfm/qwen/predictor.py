@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The predictor of a reward model on a Qwen backbone: samples of raw frames in, scores of conversations out."""
+"""The predictor for reward models on a Qwen backbone: samples of raw frames in, conversation scores out."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from rfm_client.contract import FrameScores, InvalidSampleError, RewardError, Sa
 
 
 class QwenPredictor:
-    """A reward model on a Qwen backbone, on a device. A family gives its ``score``.
+    """A reward model on a Qwen backbone, on a device. A family implements ``score``.
 
-    cache: holds frames, which requests may name, and features of temporal patches; None: no cache
+    cache: holds frames, which requests may name, and temporal patch features; None: no cache
     threads: prepare the frames of all samples
     """
 
@@ -57,9 +57,9 @@ class QwenPredictor:
         self.network.graphs = graphs
 
     def rows(self, sample: Sample) -> list[VlmRow]:
-        """Return the conversations of a sample. Raises InvalidSampleError."""
+        """Return the conversations for a sample. Raises InvalidSampleError."""
         rows = self.collator.rows(sample)
-        # Beyond this limit the backbone has learned no positions, so scores would mean nothing.
+        # The backbone has not learned positions beyond this limit, so scores would mean nothing.
         longest = max(row.num_tokens for row in rows)
         if longest > self._max_tokens:
             expected = f"at most {self._max_tokens} tokens (max_position_embeddings of this checkpoint)"
@@ -69,22 +69,22 @@ class QwenPredictor:
         return trees(rows, self.collator.visual_pad, are_images=self.collator.config.multi_image)
 
     def num_tokens(self, row: VlmRow) -> int:
-        """Return the number of tokens that the language model computes."""
+        """Return how many tokens the language model computes."""
         return row.cost
 
     def sequences(self, row: VlmRow) -> Sequence[VlmRow]:
-        """Return the conversations of the row."""
+        """Return the conversations in the row."""
         return row.alone or (row,)
 
     def work_ahead(self, rows: Sequence[VlmRow]) -> None:
-        """Resize the frames whose features are not cached, and start their copy to the device."""
+        """Resize the frames whose features are not cached, and start copying them to the device."""
         for video in (video for row in rows for video in row.videos):
             if video.sized is None:
                 sized = self.collator.to_size(video, self.cache, self.threads)
                 video.sized = replace(sized, pixels=self._copies.send(sized.pixels))
 
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
-        """Return one batch of conversations of any kind."""
+        """Return one batch with conversations of any kind."""
         self.work_ahead(rows)
         graphs = self.network.graphs
         length = None if graphs is None else graphs.padded(len(rows), max(row.num_tokens for row in rows))
@@ -92,22 +92,22 @@ class QwenPredictor:
         return batch.pinned() if self._copies.pins else batch
 
     def count(self, batch: VlmBatch, execution: Execution) -> None:
-        """Count tokens, without and with padding, the encoded frames, and the frames with cached features."""
+        """Count tokens, without and with padding, encoded frames, and frames with cached features."""
         execution.add_tokens(batch.num_tokens, batch.num_slots)
         execution.num_encoded += 0 if batch.pixels is None else batch.pixels.num_shown
         execution.num_found += 0 if batch.layout is None else len(batch.layout.kept) * self.collator.frames_per_shot
         execution.cache_bytes = None if self.cache is None else self.cache.num_bytes
 
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
-        """Run one forward pass; return each row's scores, or its error."""
+        """Run one forward pass; return each row's scores or error."""
         raise NotImplementedError
 
     def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
-        """Return the scores of a progress sample's frames, from those of all its rows."""
+        """Return frame scores for a progress sample, joined from all its rows."""
         return of_rows(sample, rows)
 
     def _output(self, batch: VlmBatch, *arguments: Any) -> Any:
-        """Return the network's output. Out of memory, free what is kept: the engine tries again with fewer rows."""
+        """Return the network's output. Out of memory, free caches and graphs: the engine retries with fewer rows."""
         self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
         try:
             with memory_errors():
@@ -120,9 +120,9 @@ class QwenPredictor:
             raise
 
     def _keep(self, rows: Sequence[VlmRow], layout: Layout | None, made: torch.Tensor | None) -> None:
-        """Cache each video's frames and its new features; skip a video that is larger than the cache.
+        """Cache the videos' frames and new features; skip videos larger than the cache.
 
-        layout: of the shots; None: nothing can be cached
+        layout: where the shots' tokens lie; None: nothing can be cached
         """
         if self.cache is None or layout is None:
             return

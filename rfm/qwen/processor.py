@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """A base model's tokenizer and preprocessing, in transformers' files.
 
-Each setting of preprocessor_config.json, video_preprocessor_config.json and processor_config.json, as transformers 4.57
-to 5.24 write them, is applied, without effect here, or refused unless it has the value that leaves pixels as they are
-computed here. A null is the same as a missing key.
+Every setting that transformers 4.57 to 5.24 write into preprocessor_config.json, video_preprocessor_config.json or
+processor_config.json is applied, has no effect here, or is refused unless its value leaves the pixels as they are
+computed here. A null means a missing key.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def is_at_least(version: int) -> bool:
 
 PROCESSOR_CONFIG = "processor_config.json"
 VIDEO_PREPROCESSOR_CONFIG = "video_preprocessor_config.json"
-# Files of preprocessing, and their keys in PROCESSOR_CONFIG of transformers 5.
+# Preprocessing files, and their keys in transformers 5's PROCESSOR_CONFIG.
 OF_IMAGES, OF_VIDEOS = (PREPROCESSOR_CONFIG, "image_processor"), (VIDEO_PREPROCESSOR_CONFIG, "video_processor")
 Settings: TypeAlias = Mapping[str, Any]
 _ALL: Settings = {
@@ -49,10 +49,10 @@ _RESIZING: Settings = {
     "do_resize": True, "resample": PIL_BICUBIC, "min_pixels": None, "max_pixels": None, "cap_pixels_per_frame": False,
     "max_video_tokens": 768, "fps": 2, "num_frames": None, "min_frames": 4, "max_frames": 768,
 }  # fmt: skip
-# Values that leave pixels as they are computed here, by the code that trained or that asks the model.
-SIZED_BEFORE: Settings = _OF_QWEN  # RFM and Robometer resize frames themselves, and turn the processor's resizing off
+# Values that leave pixels as they are computed here, by the code that trained the model or runs it.
+SIZED_BEFORE: Settings = _OF_QWEN  # RFM and Robometer resize frames themselves, and turn off the processor's resizing
 SIZED_BY_PROCESSOR: Settings = {**_OF_QWEN, **_RESIZING}
-# Settings that are read, and those without effect on pixels of RGB frames.
+# Settings that are read, and settings without effect on RGB frames.
 _APPLIED = {"image_mean", "image_std", "patch_size", "resample", "size"}
 _IDLE = {
     "_valid_processor_keys", "auto_map", "crop_size", "data_format", "default_to_square", "device", "disable_grouping",
@@ -65,10 +65,10 @@ _CHANNELS = 3
 
 
 def read_preprocessor(processor: str | Path, file: str, key: str) -> dict[str, Any]:
-    """Return the preprocessing in ``file`` and in ``key`` of transformers 5's file; for videos else that of images.
+    """Return the preprocessing from ``file`` and from ``key`` in transformers 5's file; videos fall back to images.
 
     transformers 4.57 reads the former first, transformers 5 the latter.
-    Raises OSError if there is neither, CheckpointError if they disagree.
+    Raises OSError if neither exists, CheckpointError if they disagree.
     """
     folder = local_copy(processor)
     nested, found = _optional(folder / PROCESSOR_CONFIG).get(key), _optional(folder / file)
@@ -92,7 +92,7 @@ def _optional(file: Path) -> dict[str, Any]:
 
 
 def check_settings(settings: Settings, neutral: Settings, where: object) -> None:
-    """Raise CheckpointError for a setting that is not applied and has another value than its neutral one.
+    """Raise CheckpointError for a setting that is not applied and differs from its neutral value.
 
     neutral: SIZED_BEFORE or SIZED_BY_PROCESSOR
     """
@@ -124,7 +124,7 @@ def _is_same(value: Any, neutral: Any) -> bool:
 
 
 def normalisation_of(settings: Settings, neutral: Settings, where: object) -> Normalisation:
-    """Return the normalisation that a preprocessor's settings state. Raises CheckpointError, as ``check_settings``."""
+    """Return the normalisation in a preprocessor's settings. Raises CheckpointError, as ``check_settings``."""
     check_settings(settings, neutral, where)
     mean, std = (_numbers(settings, name, where) for name in ("image_mean", "image_std"))
     if min(std) <= 0:
@@ -133,9 +133,9 @@ def normalisation_of(settings: Settings, neutral: Settings, where: object) -> No
 
 
 def pixel_limits(settings: Settings, where: object) -> dict[str, int]:
-    """Return the least and most pixels of an image, ``least_px`` and ``most_px``. Raises CheckpointError.
+    """Return an image's least and most pixels, ``least_px`` and ``most_px``. Raises CheckpointError.
 
-    ``min_pixels`` and ``max_pixels``, where they are stated, take the place of ``size``, as in transformers.
+    ``min_pixels`` and ``max_pixels``, if set, override ``size``, as in transformers.
     """
     size = settings.get("size")
     stated = {**size} if isinstance(size, Mapping) else {}
@@ -148,7 +148,7 @@ def pixel_limits(settings: Settings, where: object) -> dict[str, int]:
 
 
 def patch_px(settings: Settings, vision: Settings, where: object) -> int:
-    """Return the side of a patch, which preprocessor and vision tower must state alike. Raises CheckpointError."""
+    """Return a patch's side, on which preprocessor and vision tower must agree. Raises CheckpointError."""
     expected, stated = vision["patch_size"], settings.get("patch_size")
     if type(stated) is not int or stated != expected:
         got = "none" if stated is None else shown(stated)
@@ -165,19 +165,19 @@ def _numbers(settings: Settings, name: str, where: object) -> tuple[float, ...]:
 
 
 TOKENIZER_CONFIG = "tokenizer_config.json"
-# Fields of TOKENIZER_CONFIG that transformers 4.57 and 5 read alike; the rest is in tokenizer.json.
+# TOKENIZER_CONFIG fields that transformers 4.57 and 5 read alike; the rest is in tokenizer.json.
 _KEPT = (
     "bos_token", "clean_up_tokenization_spaces", "eos_token", "model_max_length", "pad_token", "padding_side",
     "unk_token",
 )  # fmt: skip
-# Fields of a backbone's config.json with token ids.
+# Token id fields in a backbone's config.json.
 _STATED_TOKENS = {"image_token_id": IMAGE_PAD, "video_token_id": VIDEO_PAD, "vision_start_token_id": VISION_START}
 
 
 def read_processor(processor: str | Path, *, videos: bool = False) -> tuple[Any, dict[str, Any]]:
-    """Return the tokenizer, with its chat template, and the preprocessing of images in a folder or of a Hub id.
+    """Return the tokenizer, with its chat template, and the image preprocessing from a folder or Hub id.
 
-    videos: the preprocessing of videos in its place
+    videos: return the video preprocessing instead
     Raises CheckpointError.
     """
     try:
@@ -206,7 +206,7 @@ def check_tokens(
 
 
 def _tokenizer(folder: Path) -> Any:
-    """Load the tokenizer, also if transformers 5 wrote its configuration, which 4.57 does not read."""
+    """Load the tokenizer, even if transformers 5 wrote its configuration, which 4.57 does not read."""
     from transformers import AutoTokenizer, PreTrainedTokenizerFast
 
     config = read_json(_required(folder / TOKENIZER_CONFIG))
@@ -225,7 +225,7 @@ def _required(file: Path) -> Path:
 
 
 def _chat_template(folder: Path, tokenizer: Any) -> str:
-    """Return the processor's chat template, which upstream uses, else the tokenizer's. Raises ValueError."""
+    """Return the processor's chat template, which upstream uses, or else the tokenizer's. Raises ValueError."""
     from transformers import ProcessorMixin
 
     of_processor = ProcessorMixin.get_processor_dict(str(folder))[0].get("chat_template")

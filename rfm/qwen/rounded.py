@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Linear layers whose weights have 8 or 4 bits. Each forward pass decodes them; inputs and products are not rounded.
+"""Linear layers with 8-bit or 4-bit weights. Each forward pass decodes them; inputs and products are not rounded.
 
-So a row's scores do not depend on the other rows of its batch, as they would with rounded inputs. N outputs and K
-inputs of a layer.
+So a row's scores do not depend on other rows in its batch, as they would with rounded inputs. N outputs and K inputs
+per layer.
 
 int8: weight int8 [N, K] and scale [N, 1]; a value is weight * scale.
-nf4: weight uint8 [N, K / 2], two codes a byte, and scale float32 [blocks], as ``rfm.published.nf4`` describes them.
+nf4: weight uint8 [N, K / 2], two codes per byte, and scale float32 [blocks], described in ``rfm.published.nf4``.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from rfm.engine.layers import linear
 from rfm.files import CheckpointError
 from rfm.weights import DECODED, SCALE, VALUES_OF_BYTE
 
-# The layers that may be rounded: linear ones of the language model and the vision tower. Their weights are nine tenths
-# of a network's bytes; the embedding, the heads and what stands between the parts keep their numbers.
+# The layers that may be rounded: linear layers in the language model and the vision tower. They hold nine tenths of a
+# network's weight bytes; the embedding, the heads and the layers between the two parts stay unrounded.
 _LAYER = re.compile(r"\.(layers|blocks)\.\d+\..*\.weight")
-_MOST = 127  # of int8, so that zero is in the middle
+_MOST = 127  # int8 limit, so that zero is in the middle
 INSTALL = 'pip install ".[quantized]"'
 
 
 class RoundedLinear(nn.Module):
-    """An ``nn.Linear`` with a rounded weight, and perhaps with LoRA factors beside it, as in PEFT."""
+    """An ``nn.Linear`` with a rounded weight and optional LoRA factors beside it, as in PEFT."""
 
     weight: Tensor
     scale: Tensor
@@ -59,7 +59,7 @@ class RoundedLinear(nn.Module):
 
 
 class Int8Linear(RoundedLinear):
-    """A linear layer with 8 bits for each value, and a scale for each output."""
+    """A linear layer with 8 bits per value, and one scale per output."""
 
     def __init__(self, layer: nn.Linear, scale: Tensor, rank: int | None) -> None:
         super().__init__(layer, rank)
@@ -73,7 +73,7 @@ class Int8Linear(RoundedLinear):
 
 
 class Nf4Linear(RoundedLinear):
-    """A linear layer in NF4, which bitsandbytes decodes. ``decoded``: empty, in the dtype of the decoded values"""
+    """A linear layer in NF4, which bitsandbytes decodes. ``decoded``: empty, in the decoded values' dtype."""
 
     decoded: Tensor
 
@@ -108,7 +108,7 @@ class Nf4Linear(RoundedLinear):
 
 
 def may_be_rounded(name: str) -> bool:
-    """Return True if a weight of this name, also LoRA-wrapped, belongs to a layer that may be rounded."""
+    """Return True if a weight with this name, also LoRA-wrapped, belongs to a layer that may be rounded."""
     return _LAYER.search(name) is not None
 
 
@@ -118,22 +118,22 @@ def is_rounded(name: str, tensor: Tensor) -> bool:
 
 
 def shape_of(weight: Tensor) -> list[int]:
-    """Return the shape of a weight's values, [N, K]."""
+    """Return the decoded shape of a weight, [N, K]."""
     rows, *columns = weight.shape
     return [rows, columns[0] * VALUES_OF_BYTE] if weight.dtype is torch.uint8 else [rows, *columns]
 
 
 def fit(network: nn.Module, weights: Mapping[str, Tensor], factors: Mapping[str, Tensor] | None = None) -> None:
-    """Replace layers of the network by rounded ones where the weights are rounded.
+    """Replace the network's layers by rounded ones where the weights are rounded.
 
-    factors: of LoRA; those of rounded weights stay beside them
+    factors: LoRA factors; those for rounded weights stay beside them
     Raises CheckpointError if bitsandbytes is missing.
     """
     modules = dict(network.named_modules())
     for path in (name.removesuffix(SCALE) for name in weights if name.endswith(SCALE)):
         layer = modules.get(path)
         if type(layer) is not nn.Linear:
-            continue  # ``check_shapes`` names what does not fit
+            continue  # ``check_shapes`` reports the mismatch
         down = (factors or {}).get(f"{path}.lora_A.weight")
         rank = None if down is None else len(down)
         scale, decoded = weights[path + SCALE], weights.get(path + DECODED)
@@ -143,11 +143,11 @@ def fit(network: nn.Module, weights: Mapping[str, Tensor], factors: Mapping[str,
 
 
 def rounded(name: str, weight: Tensor, kind: Weights, dtype: torch.dtype) -> dict[str, Tensor]:
-    """Return the tensors of a rounded weight by name.
+    """Return the tensors for a rounded weight by name.
 
-    name: of the weight, which ends in ``.weight``
+    name: weight name, which ends in ``.weight``
     weight: float32 [N, K]
-    dtype: of the decoded values
+    dtype: type of decoded values
     """
     if kind == "nf4":
         return of_layer(name, *quantize(weight), dtype)
@@ -156,9 +156,9 @@ def rounded(name: str, weight: Tensor, kind: Weights, dtype: torch.dtype) -> dic
     return {name: steps.round().clamp(-_MOST, _MOST).to(torch.int8), name.removesuffix(".weight") + SCALE: scale}
 
 
-NF4_BLOCK_SIZES = [2**power for power in range(5, 13)]  # of bitsandbytes, for weights and scales
-_NF4_BITS = 4  # of a value
-_NF4_BLOCK_SIZE = 64  # of ``quantize``, bitsandbytes' default
+NF4_BLOCK_SIZES = [2**power for power in range(5, 13)]  # in bitsandbytes, for weights and scales
+_NF4_BITS = 4  # per value
+_NF4_BLOCK_SIZE = 64  # in ``quantize``, bitsandbytes' default
 NF4_CODES = (
     -1.0, -0.6961928009986877, -0.5250730514526367, -0.39491748809814453, -0.28444138169288635, -0.18477343022823334,
     -0.09105003625154495, 0.0, 0.07958029955625534, 0.16093020141124725, 0.24611230194568634, 0.33791524171829224,
@@ -167,7 +167,7 @@ NF4_CODES = (
 
 
 def of_layer(name: str, codes: Tensor, scales: Tensor, dtype: torch.dtype) -> dict[str, Tensor]:
-    """Return a layer's tensors by name. name: of the weight; dtype: of the decoded values"""
+    """Return a layer's tensors by name. name: weight name; dtype: type of decoded values."""
     path = name.removesuffix(".weight")
     return {name: codes, path + SCALE: scales, path + DECODED: torch.empty(0, dtype=dtype)}
 
@@ -184,5 +184,5 @@ def quantize(weight: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def block_size(num_values: int, num_blocks: int) -> int:
-    """Return the number of values of a block, a power of 2."""
+    """Return how many values a block has, a power of 2."""
     return max(NF4_BLOCK_SIZES[0], 1 << (math.ceil(num_values / num_blocks) - 1).bit_length())

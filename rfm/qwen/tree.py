@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Find conversations that begin alike, and make a tree of them where this saves tokens: a trunk with leaves.
+"""Find conversations that begin alike, and make a tree (a trunk with leaves) where this saves tokens.
 
 The last conversation about a video is the trunk: in TOPReward the whole episode. Each other conversation continues the
-trunk or the leaf before it, whichever has more tokens in common with it.
+trunk or the leaf before it, whichever shares more tokens with it.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from rfm.qwen.batch import VlmRow
 from rfm.qwen.leaves import Leaf, fits
 from rfm.qwen.video import Indices, Shot, shots_of
 
-WORTH = 1.5  # a tree pays if it has this many times fewer tokens; else padded rows are as fast
-MOST_LEAF_TOKENS = 65_536  # of a tree: bounds the shots and states that a pass holds
+WORTH = 1.5  # a tree pays if it has this many times fewer tokens; otherwise padded rows are as fast
+MOST_LEAF_TOKENS = 65_536  # limit per tree, which bounds the shots and states held during a pass
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Conversation:
 
     @classmethod
     def of(cls, row: VlmRow, pad: int, *, are_images: bool) -> Conversation:
-        """Return a conversation about one video. ``pad``: the token of vision"""
+        """Return a conversation about one video. ``pad``: the vision token."""
         ((_, shown),) = row.shown
         shots = list(shots_of(shown, are_images=are_images))
         at = np.flatnonzero(row.input_ids == pad)
@@ -42,13 +42,13 @@ class Conversation:
 
     @property
     def reads(self) -> tuple[int, int]:
-        """The tokens (first, behind the last) whose states are read: the query, or those of the last frame."""
+        """The tokens (first, behind the last) whose states are read: the query, or those for the last frame."""
         if self.row.query is not None:
             return self.row.query, self.row.query + 1
         return self.row.spans[0][-1]
 
     def shared(self, other: Conversation) -> int:
-        """Return the number of first tokens that equal those of ``other``, also in position and features."""
+        """Return how many first tokens equal those in ``other``, also in position and features."""
         row, before = self.row, other.row
         most = min(row.num_tokens, before.num_tokens, self.reads[0])
         pairs = enumerate(zip(self.shots, other.shots, strict=False))
@@ -69,10 +69,10 @@ class Conversation:
 
 
 def trees(rows: Sequence[VlmRow], pad: int, *, are_images: bool) -> list[VlmRow]:
-    """Return the rows of a sample as trees, or as they are where a tree saves too little. The order stays.
+    """Return a sample's rows as trees, or unchanged where a tree saves too little. The order stays.
 
-    pad: the token of vision
-    are_images: each frame is a shot; else each pair
+    pad: the vision token
+    are_images: each frame is a shot; otherwise each pair
     """
     found: list[VlmRow] = []
     for _, group in groupby(rows, key=lambda row: id(row.videos[0])):
@@ -85,7 +85,7 @@ def trees(rows: Sequence[VlmRow], pad: int, *, are_images: bool) -> list[VlmRow]
 
 
 def _trees(conversations: Sequence[Conversation]) -> list[VlmRow]:
-    """Return one tree, or those of each half if it would be too large."""
+    """Return one tree, or one per half if it would be too large."""
     rows = [each.row for each in conversations]
     packs = _packs(conversations[:-1], conversations[-1])
     ends: tuple[list[tuple[int, int]]] = ([] if rows[-1].query is not None else [conversations[-1].reads],)
@@ -116,7 +116,7 @@ def _packs(conversations: Sequence[Conversation], trunk: Conversation) -> tuple[
 
 
 def _path(pack: Sequence[Leaf], count: int) -> tuple[int, tuple[tuple[int, int], ...]]:
-    """Return where the first ``count`` tokens of a pack's last conversation lie: in the trunk, and in leaves."""
+    """Return where the last conversation's first ``count`` tokens lie: in the trunk, and in leaves."""
     last = pack[-1]
     from_trunk = min(last.from_trunk, count)
     from_leaves, rest = [], count - from_trunk

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A trajectory's frames, and its shots: the temporal patches (images, or pairs of frames) that a vision tower reads.
+"""A trajectory's frames, and its shots: the temporal patches (images or frame pairs) that a vision tower reads.
 
-A Qwen shot's key holds all that its features depend on: the digests of its frames, and their size after resizing.
+A Qwen shot's key holds all that determines its features: its frames' digests and their size after resizing.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class SizedFrames:
     """A video's resized frames, without those whose shots are all cached.
 
     pixels: uint8 [N, H', W', 3], on the CPU or the device
-    places: int64 [T], the index in ``pixels`` of each frame; -1: only cached shots show the frame
-    keys: cache key of each shot
-    kept: cached features of shots by key, [tokens, levels, D]
+    places: int64 [T], where a frame lies in ``pixels``; -1: only cached shots show the frame
+    keys: cache keys by shot
+    kept: cached shot features by key, [tokens, levels, D]
     """
 
     pixels: Tensor
@@ -46,9 +46,9 @@ class VlmVideo:
     """A trajectory's frames, shared by all its rows.
 
     frames: T frames, uint8 [H, W, 3], of equal size
-    num_shown: frames in a conversation
-    conversations: indices of the frames in each, int64 [num_shown]
-    named: digests of the frames of a sample with named frames, computed by the server; None: no named frames
+    num_shown: frames per conversation
+    conversations: frame indices per conversation, int64 [num_shown]
+    named: digests for a sample with named frames, computed by the server; None: no named frames
     sized: the resized frames; None: not yet resized
     """
 
@@ -62,7 +62,7 @@ class VlmVideo:
     def of(
         cls, frames: Sequence[UInt8Array] | UInt8Array, frame_steps: int, named: Sequence[bytes] | None = None
     ) -> VlmVideo:
-        """Return the video of a sample's frames. ``frame_steps``: of dense mode; 0: one conversation, of all frames."""
+        """Return a sample's frames as a video. ``frame_steps``: for dense mode; 0: one conversation with all frames."""
         count = len(frames)
         conversations = list(prefix_indices(count, frame_steps)) if frame_steps else [np.arange(count)]
         return cls(frames, frame_steps or count, conversations, named)
@@ -75,13 +75,13 @@ class VlmVideo:
 
     @property
     def size(self) -> tuple[int, int]:
-        """H and W of each frame."""
+        """H and W, equal for all frames."""
         height, width = self.frames[0].shape[:2]
         return height, width
 
     @cached_property
     def digests(self) -> Sequence[bytes]:
-        """The digest of each frame."""
+        """The digests by frame, from the server if the frames are named."""
         return self.named or digests_of(list(self.frames), IN_TURN)
 
     def compute_digests(self, threads: FrameThreads) -> None:
@@ -91,12 +91,12 @@ class VlmVideo:
 
     @property
     def alike(self) -> Indices:
-        """The index of the first equal frame, for each frame, int64 [T]."""
+        """For each frame, the index of the first equal frame, int64 [T]."""
         first: dict[bytes, int] = {}
         return np.array([first.setdefault(digest, index) for index, digest in enumerate(self.digests)])
 
     def is_blank(self, shot: Shot) -> bool:
-        """True if a shot's frames, which are not named, are black, as a probe's are.
+        """True if a shot's frames have no names and are black, as a probe's are.
 
         The network must compute these: cached features would not show that it works.
         """
@@ -110,15 +110,15 @@ class VlmVideo:
         return np.stack([self.frames[i] for i in needed]) if needed else np.empty((0, height, width, 3), np.uint8)
 
     def shots(self, *, are_images: bool) -> list[Shot]:
-        """Return the different shots of all conversations."""
+        """Return the distinct shots in all conversations."""
         shown = (shot for frames in self.conversations for shot in shots_of(frames, are_images=are_images))
         return list(dict.fromkeys(shown))
 
 
 def shots_of(shown: Indices, *, are_images: bool) -> Iterable[Shot]:
-    """Return the shots of a conversation that shows these frames.
+    """Return the shots in a conversation that shows these frames.
 
-    are_images: each frame is a shot; else each pair, and the last frame is repeated if their number is odd
+    are_images: each frame is a shot; otherwise each pair, and an odd last frame is repeated
     """
     if are_images:
         return zip(shown.tolist(), strict=True)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Reward models that answer in words: a batch's answers are written together, each token the likeliest.
+"""Reward models that answer in words: all answers in a batch grow together, always by the likeliest token.
 
-A model gives its prompts (``WritingCollator``) and reads its answers (``WritingPredictor.read``). The pass over the
-prompts also checks a draft of the answer's usual beginning: its tokens are accepted up to the first that is not the
-likeliest. So a draft saves passes and changes no answer.
+A model implements its prompts (``WritingCollator``) and reads its answers (``WritingPredictor.read``). The pass over
+the prompts also checks a draft of the answer's usual beginning: draft tokens are accepted up to the first that is not
+the likeliest. So a draft saves passes and changes no answer.
 
-B conversations in a batch, N tokens of the draft, D digits, V rows of the language head.
+B conversations in a batch, N draft tokens, D digits, V rows in the language head.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from rfm.qwen.predictor import QwenPredictor
 from rfm_client.contract import FrameScores, InferenceFailedError, InvalidSampleError, RewardError
 from rfm_client.contract.samples import Float32Array
 
-NOT_FINITE = -1  # instead of a token: some of its logits are not finite
-MOST_SHOWN = 200  # characters of an answer in an error
+NOT_FINITE = -1  # replaces a token if some of its logits are not finite
+MOST_SHOWN = 200  # answer characters in an error message
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class WritingConfig(LanguageConfig):
     """The configuration of a model that writes answers.
 
     stops: ids of the tokens that end an answer
-    max_new_tokens: most tokens of an answer
+    max_new_tokens: most tokens per answer
     """
 
     stops: tuple[int, ...]
@@ -46,10 +46,10 @@ class WritingConfig(LanguageConfig):
 
 
 class WritingCollator(LanguageCollator):
-    """The collator of prompts that a written answer follows.
+    """The collator for prompts that a written answer follows.
 
     draft: int64 [N], the tokens with which an answer usually begins
-    digits: ids of the D tokens whose logits are kept where the first of them is written
+    digits: ids of the D tokens whose logits are kept at the first digit of an answer
     """
 
     config: Any
@@ -64,7 +64,7 @@ class WritingCollator(LanguageCollator):
         """Return the batch of conversations with the draft behind each.
 
         length: as in ``QwenCollator.collate``
-        The queries are the last token of each conversation and the tokens of the draft.
+        The queries are each conversation's last token and the draft tokens.
         """
         batch = super().collate([self._drafted(row) for row in rows], length)
         back = torch.arange(-len(self.draft), 1)
@@ -89,9 +89,9 @@ class WrittenAnswer:
     """An answer while it is written.
 
     tokens: without the token that ends it
-    digit_logits: float32 [D], logits of the collator's digits where the first of them is written; None: there is none
+    digit_logits: float32 [D], logits for the collator's digits at the first digit; None: no digit yet
     has_ended: no further token belongs to it
-    is_finite: all logits of its tokens are finite
+    is_finite: all logits for its tokens are finite
     """
 
     tokens: list[int] = field(default_factory=list)
@@ -103,7 +103,7 @@ class WrittenAnswer:
 class WritingPredictor(QwenPredictor):
     """A vision-language model on a device, which writes answers.
 
-    expected: what an answer must hold, for the error of one that cannot be read
+    expected: what an answer must hold, for the error message if it cannot be read
     """
 
     collator: WritingCollator
@@ -112,12 +112,12 @@ class WritingPredictor(QwenPredictor):
     def read(
         self, text: str, answer: WrittenAnswer, row: VlmRow, execution: Execution
     ) -> RowScores | RewardError | None:
-        """Return the scores in an answer, or its error; None: it cannot be read."""
+        """Return the scores in an answer, or its error; None: the answer cannot be read."""
         raise NotImplementedError
 
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
-        """Return each row's scores, or its error.
+        """Return each row's scores or error.
 
         execution: its ``on_forward`` is called after each forward pass
         """
@@ -127,14 +127,14 @@ class WritingPredictor(QwenPredictor):
         return scores
 
     def num_tokens(self, row: VlmRow) -> int:
-        """Return the number of tokens in the row's first pass, which include the draft."""
+        """Return how many tokens the row's first pass has, including the draft."""
         return row.num_tokens + len(self.collator.draft)
 
     @torch.inference_mode()
     def write(
         self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution
     ) -> tuple[list[WrittenAnswer], Tensor | None]:
-        """Return the answers, each token the likeliest, and the features that the vision tower computed.
+        """Return the answers, always with the likeliest token, and the features that the vision tower computed.
 
         execution: its ``on_forward`` is called after each forward pass
         """
@@ -158,9 +158,9 @@ class WritingPredictor(QwenPredictor):
         return answers, output.made
 
     def _begun(self, tokens: Indices, digit_logits: Float32Array) -> tuple[list[WrittenAnswer], Indices]:
-        """Return the answers after the first pass, and how many of the draft's tokens each answer accepts.
+        """Return the answers after the first pass, and how many draft tokens each accepts.
 
-        tokens, digit_logits: int64 [B, N + 1], float32 [B, N + 1, D], behind the prompt and each token of the draft
+        tokens, digit_logits: int64 [B, N + 1], float32 [B, N + 1, D], behind the prompt and behind each draft token
         """
         num_right: Indices = (tokens[:, :-1] == self.collator.draft).cumprod(axis=1).sum(axis=1)
         answers = [WrittenAnswer() for _ in tokens]
@@ -175,7 +175,7 @@ class WritingPredictor(QwenPredictor):
         return tokens.cpu().numpy(), logits[..., list(self.collator.digits)].float().cpu().numpy()
 
     def _add(self, answer: WrittenAnswer, token: int, digit_logits: Float32Array) -> None:
-        """Add the next token to an answer that has not ended. digit_logits: float32 [D]"""
+        """Add the next token to an answer that has not ended. digit_logits: float32 [D]."""
         config = self.collator.config
         if answer.has_ended:
             return
@@ -199,17 +199,17 @@ class WritingPredictor(QwenPredictor):
         return unread(self.expected, text)
 
     def _keep_finite(self, rows: Sequence[VlmRow], batch: VlmBatch, made: Tensor | None) -> None:
-        """Cache the features of a pass, if all are finite."""
+        """Cache the features from a pass, if all are finite."""
         if made is None or bool(made.isfinite().all()):
             self._keep(rows, batch.layout, made)
 
 
 def progress_of(score: float) -> RowScores:
-    """Return the scores of a row whose answer holds one number."""
+    """Return the scores for a row whose answer holds one number."""
     progress = np.array([score])
     return RowScores([FrameScores(progress=progress, success=no_success(progress))])
 
 
 def unread(expected: str, text: str) -> InvalidSampleError:
-    """Return the error of an answer that holds no score."""
+    """Return the error for an answer that holds no score."""
     return InvalidSampleError.at("answer", expected, repr(text[:MOST_SHOWN]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""ReWiND: the transformer that scores embeddings, and the encoders that make them from raw frames."""
+"""ReWiND: the transformer that scores embeddings, and the encoders that compute them from raw frames."""
 
 from rfm.engine.family import Family
 from rfm.families.rewind.checkpoint import restore

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""ReWiND checkpoints in memory: the weights of the network, and perhaps those of the encoders."""
+"""ReWiND checkpoints in memory: the network's weights, and optionally the encoders'."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ MODEL_TYPE = "rewind_transformer"
 class RewindCheckpoint:
     """A ReWiND checkpoint in memory.
 
-    network: weights of RewindTransformer
-    image_encoder, text_encoder: weights of encoders without their prefix; empty if the checkpoint has none
+    network: weights for RewindTransformer
+    image_encoder, text_encoder: encoder weights without their prefix; empty if the checkpoint has none
     """
 
     config: RewindConfig
@@ -59,7 +59,7 @@ class RewindCheckpoint:
         return {NETWORK: self.network, "image_encoder": self.image_encoder, "text_encoder": self.text_encoder}
 
     def flop(self, sample: Sample) -> float:
-        """Return the operations of a sample's products: two for each parameter and token."""
+        """Return how many operations a sample's products take: two per parameter and token."""
         counts = [trajectory.num_frames for trajectory in sample.trajectories]
         num_tokens = self.config.num_tokens(counts[0], sum(counts[1:]))
         return 2.0 * num_tokens * sum(tensor.numel() for tensor in self.network.values())

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Encode raw frames and tasks into the embeddings that a ReWiND transformer reads.
 
-A frame's embedding is the pooled output of a DINOv2-type image encoder. A task's is the mean over the tokens of a
-BERT-type sentence encoder's last hidden state, not normalised. Both networks are from ``transformers``.
-T frames, H x W pixels, Dv and Dt widths of the embeddings.
+A frame embedding is the pooled output of a DINOv2-type image encoder. A task embedding is the mean over all tokens in a
+BERT-type sentence encoder's last hidden state, not normalised. Both networks come from ``transformers``.
+T frames, H x W pixels, embedding widths Dv and Dt.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Encoders:
     ) -> Encoders:
         """Load the encoders from local folders or Hugging Face ids.
 
-        image_weights, text_weights: a checkpoint's own, in place of the sources'
+        image_weights, text_weights: a checkpoint's own, instead of the sources'
         Raises ImportError without transformers, OSError for a source that cannot be read, ValueError and
         CheckpointError for a source that does not fit.
         """
@@ -95,14 +95,14 @@ class Encoders:
 
     @classmethod
     def describe(cls, folder: Path) -> Description:
-        """Return the description of the encoders that ``save`` wrote into ``folder``, without loading them."""
+        """Describe the encoders that ``save`` wrote into ``folder``, without loading them."""
         file = folder / IMAGE_ENCODER_FOLDER / PREPROCESSOR_CONFIG
         preprocessor = ImagePreprocessor.from_config(read_json(file), str(file))
         return Description(network={"class": cls.__name__}, frame_size=preprocessor.frame_size)
 
     @property
     def description(self) -> Description:
-        """The export's record of these encoders."""
+        """The encoders' record in the export."""
         return Description(network={"class": type(self).__name__}, frame_size=self.preprocessor.frame_size)
 
     def to(self, device: torch.device) -> Encoders:
@@ -114,12 +114,12 @@ class Encoders:
 
     @property
     def video_feature_dim(self) -> int:
-        """Dv, the width of a frame's embedding."""
+        """Dv, the width of a frame embedding."""
         return int(self.image_model.config.hidden_size)
 
     @property
     def text_feature_dim(self) -> int:
-        """Dt, the width of a task's embedding."""
+        """Dt, the width of a task embedding."""
         return int(self.text_model.config.hidden_size)
 
     def encode(
@@ -128,10 +128,10 @@ class Encoders:
         execution: Execution | None = None,
         cache: FeatureCache[Float32Array] | None = None,
     ) -> list[EncoderSample | RewardError]:
-        """Return each sample with embeddings of its frames and task, or its error.
+        """Return each sample with embeddings for its frames and task, or its error.
 
-        execution: the costs are added to it; its tokens are those of images (without padding) and tasks
-        cache: of embeddings, which encodes equal frames and tasks once; None: no cache, and no named frames
+        execution: receives the costs, with image tokens (no padding) and task tokens
+        cache: embedding cache, which encodes equal frames and tasks once; None: no cache, and no named frames
         """
         execution = execution or Execution()
         with execution.forwarding():
@@ -193,7 +193,7 @@ class Encoders:
         return of_videos, [texts[task_digest(task)] for task in tasks]
 
     def _named(self, trajectories: Sequence[Trajectory]) -> list[Sequence[NamedFrame]]:
-        """Return the frames of each trajectory with their digests."""
+        """Return the trajectories' frames with their digests."""
         whole = [frame for each in trajectories if each.named is None for frame in each.positions]
         named = zip(digests_of(whole, self.threads), whole, strict=True)
         return [list(islice(named, each.num_frames)) if each.named is None else each.named for each in trajectories]
@@ -209,7 +209,7 @@ class Encoders:
     def _images(
         self, frames: Sequence[UInt8Array], execution: Execution
     ) -> Sequence[Float32Array | InferenceFailedError]:
-        """Return float32 [Dv] of each frame [H, W, 3], or its error. The frames may differ in size."""
+        """Return float32 [Dv] or an error for each frame [H, W, 3]. The frames may differ in size."""
 
         def forward(crops: Tensor) -> list[Tensor]:
             sent = self._copies.send(crops)
@@ -229,7 +229,7 @@ class Encoders:
     def encode_tasks(
         self, tasks: Sequence[str], execution: Execution | None = None
     ) -> list[Float32Array | InferenceFailedError]:
-        """Return float32 [Dt] of each task, or its error."""
+        """Return float32 [Dt] or an error for each task."""
         execution = execution or Execution()
 
         def forward(part: list[str]) -> list[Float32Array]:
@@ -244,7 +244,7 @@ class Encoders:
         return execution.run(forward, list(tasks))
 
     def _crop_batches(self, frames: Sequence[UInt8Array], execution: Execution) -> Iterator[Tensor]:
-        """Yield the crops of the frames in order, uint8 [N, H', W', 3], IMAGES_PER_FORWARD at a time."""
+        """Yield the frames' crops in order, uint8 [N, H', W', 3], IMAGES_PER_FORWARD at a time."""
         for start in range(0, len(frames), IMAGES_PER_FORWARD):
             with execution.collating():
                 parts = self.threads.parts(self._crops, frames[start : start + IMAGES_PER_FORWARD])
@@ -255,7 +255,7 @@ class Encoders:
         return torch.cat([self.preprocessor.crops(as_tensor(frame)[None]) for frame in frames])
 
     def _check_task(self, task: str) -> None:
-        """Raise InvalidSampleError for an empty task, or a task beyond the text encoder's limit: none is truncated."""
+        """Raise InvalidSampleError for an empty task or one beyond the text encoder's limit; none is truncated."""
         if not task.strip():
             raise InvalidSampleError.at("task", "a task sentence", repr(task))
         limit = min(self.tokenizer.model_max_length, self.text_model.config.max_position_embeddings)
@@ -269,12 +269,12 @@ class Encoders:
 
 
 def task_digest(task: str) -> bytes:
-    """Return the cache key of a task's embedding. It is longer than a frame's digest, so no caller can send it."""
+    """Return the cache key for a task embedding, longer than a frame digest, so no caller can send it."""
     return b"task" + hashlib.sha256(task.encode()).digest()
 
 
 def _of_video(images: Sequence[Float32Array | RewardError]) -> Float32Array | RewardError:
-    """Stack the frames' embeddings to float32 [T, Dv]; the first error replaces them."""
+    """Stack the frame embeddings to float32 [T, Dv]; the first error replaces them."""
     error = next((image for image in images if isinstance(image, RewardError)), None)
     return np.stack(images) if error is None else error  # type: ignore[arg-type]  # all are arrays
 
@@ -294,7 +294,7 @@ def _embedded(
 
 
 def _check_shapes(trajectory: Trajectory) -> None:
-    """Raise InvalidSampleError for narrow frames: resizing the shorter side would make huge images of them."""
+    """Raise InvalidSampleError for narrow frames: resizing the shorter side would make them huge."""
     frames = trajectory.positions[:1] if trajectory.named is None else [frame for _, frame in trajectory.named]
     for height, width in {frame.shape[:2] for frame in frames if frame.dtype == np.uint8}:
         if min(height, width) < 1 or max(height, width) > MAX_ENCODER_ASPECT_RATIO * min(height, width):

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
 """The ReWiND transformer: frame and text embeddings in; progress, success, preference, similarity out.
 
-B rows, L tokens of the longest row, N tokens of all rows, T frames of a trajectory, D width, K progress bins (1:
+B rows, L tokens in the longest row, N tokens in all rows, T frames in a trajectory, width D, K progress bins (1:
 continuous progress).
 
-A row is the token sequence ``[text] [first trajectory] ([second trajectory] [query])``. The network learns the order
-of frames from the causal mask, from an embedding added to each trajectory's first frame and, in some checkpoints, from
-a progress token behind each frame. There is no other positional encoding.
+A row is the token sequence ``[text] [first trajectory] ([second trajectory] [query])``. The network learns frame order
+from the causal mask, from an embedding added to each trajectory's first frame and, in some checkpoints, from a progress
+token behind each frame. There is no other positional encoding.
 Rows are packed one after the other without padding, [N, D]. Only attention needs rows of equal length, [B, L, D].
 Architecture: ReWiND (https://arxiv.org/abs/2505.10911) as in the public implementation ``reward_fm``.
 """
@@ -38,11 +38,11 @@ def rounded_up(count: int) -> int:
 
 @dataclass(frozen=True)
 class Packing:
-    """The layout of packed rows: one after the other, then padding up to ``rounded_up(N)`` tokens, P in all.
+    """The layout of packed rows: one after the other, then padding up to ``rounded_up(N)`` tokens, P in total.
 
     num_rows, longest, num_tokens: B, L and N
-    at: int64 [P], the index of each token in [B * L]; 0 for padding
-    mask: bool [B, 1, 1, L], true at tokens of the row; None if all rows are equally long
+    at: int64 [P], each token's index in [B * L]; 0 for padding
+    mask: bool [B, 1, 1, L], true at the row's tokens; None if all rows are equally long
     """
 
     num_rows: int
@@ -53,7 +53,7 @@ class Packing:
 
     @classmethod
     def of(cls, lengths: npt.NDArray[np.int64]) -> Packing:
-        """Return the packing of rows with these numbers of tokens, int64 [B]."""
+        """Return the packing for rows with these token counts, int64 [B]."""
         num_rows, longest, num_tokens = len(lengths), int(lengths.max()), int(lengths.sum())
         at = np.zeros(rounded_up(num_tokens), np.int64)
         at[:num_tokens] = np.arange(num_tokens) + np.repeat(np.arange(num_rows) * longest - starts(lengths), lengths)
@@ -67,11 +67,11 @@ class Packing:
         return replace(self, at=self.at.to(device), mask=None if self.mask is None else self.mask.to(device))
 
     def empty(self, width: int, like: Tensor) -> Tensor:
-        """Return zeros [P, width] with dtype and device of ``like``."""
+        """Return zeros [P, width] with the dtype and device of ``like``."""
         return like.new_zeros(len(self.at), width)
 
     def padded(self, packed: Tensor) -> Tensor:
-        """Unpack tokens: [P, D] -> [B, L, D], zeros behind the end of each row."""
+        """Unpack tokens: [P, D] -> [B, L, D], with zeros behind each row's end."""
         tokens = packed[: self.num_tokens]
         if self.mask is not None:
             rows = packed.new_zeros(self.num_rows * self.longest, packed.shape[-1])
@@ -87,7 +87,7 @@ class Packing:
 
 
 def starts(lengths: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return the start of each of B consecutive parts with these lengths, int64 [B]."""
+    """Return where B consecutive parts with these lengths start, int64 [B]."""
     return np.cumsum(lengths) - lengths
 
 
@@ -96,10 +96,10 @@ FEED_FORWARD_RATIO = 4
 
 @dataclass(frozen=True)
 class RewindConfig:
-    """The configuration of a network; the fields of upstream's config.json keep their names.
+    """A network's configuration; fields from upstream's config.json keep their names.
 
     trained_frames: as in ``rfm_client.contract.description.Description``
-    trained_padding: training padded shorter trajectories to ``trained_frames``, as upstream's does; None: unknown
+    trained_padding: training padded shorter trajectories to ``trained_frames``, as upstream does; None: unknown
     """
 
     video_feature_dim: int
@@ -124,7 +124,7 @@ class RewindConfig:
 
     @property
     def max_frames(self) -> int | None:
-        """Frames of the longest trajectory that the network can score; None: no limit."""
+        """Frames in the longest trajectory that the network can score; None: no limit."""
         return self.max_len if self.use_per_frame_progress_token else None
 
     @property
@@ -133,23 +133,23 @@ class RewindConfig:
         return 2 if self.use_per_frame_progress_token else 1
 
     def num_tokens(self, num_first: int, num_second: int) -> int:
-        """Return the tokens of a row with these numbers of frames; num_second = 0: a single trajectory."""
+        """Return how many tokens a row with these frame counts has; num_second = 0: a single trajectory."""
         query = 1 if num_second else 0
         return 1 + self.tokens_per_frame * (num_first + num_second) + query
 
 
 @dataclass(frozen=True)
 class RewindBatch:
-    """Packed rows of any lengths and kinds, with F frames in all and Q queries (rows of two trajectories).
+    """Packed rows, whatever their length and kind, with F frames in total and Q queries (two-trajectory rows).
 
     text: float32 [B, Dt]
-    video: float32 [V, Dv], embeddings of frames, then padding
-    shown: int64 [F], the index in ``video`` of each frame (in dense mode many rows show a frame); None: 0 to F - 1
+    video: float32 [V, Dv], frame embeddings, then padding
+    shown: int64 [F], the frames' indices in ``video`` (in dense mode many rows show a frame); None: 0 to F - 1
     is_similarity: bool [Q], true for similarity, false for preference; None: all are preference
-    packing: the layout of the tokens
+    packing: the token layout
     text_at, frame_at, query_at: int64 [B], [F], [Q], indices of packed tokens
-    place: int64 [F], each frame's index in its trajectory, plus max_len in a second trajectory
-    first_starts, second_starts: int64 [B], [Q], index among the F frames of each first and second trajectory's start
+    place: int64 [F], a frame's index in its trajectory, plus max_len in a second trajectory
+    first_starts, second_starts: int64 [B], [Q], where first and second trajectories start among the F frames
     read_at: int64 [R], packed tokens whose outputs are read: each frame's last, each query, then padding
     """
 
@@ -179,7 +179,7 @@ class RewindBatch:
     ) -> RewindBatch:
         """Return the batch of rows with these frames.
 
-        num_frames: int64 [B, 2], frames of the first and second trajectory; 0: no second trajectory
+        num_frames: int64 [B, 2], frames in the first and second trajectory; 0: no second trajectory
         others: as in the class
         Raises ValueError for a trajectory with more frames than progress tokens.
         """
@@ -214,7 +214,7 @@ class RewindBatch:
 
 @dataclass(frozen=True)
 class RewindOutput:
-    """Logits of a RewindBatch: progress [F, K], success [F] (None without that head), query [Q]."""
+    """Logits for a RewindBatch: progress [F, K], success [F] (None without that head), query [Q]."""
 
     progress: Tensor
     success: Tensor | None
@@ -222,9 +222,9 @@ class RewindOutput:
 
 
 class SelfAttention(nn.Module):
-    """Multi-head attention of packed tokens within their row; parameters named as nn.MultiheadAttention's.
+    """Multi-head attention between packed tokens in the same row; parameter names follow nn.MultiheadAttention.
 
-    The layer applies ``out_proj``, since it may need it for some tokens alone.
+    The layer applies ``out_proj``, since it may need it only for some tokens.
     """
 
     def __init__(self, config: RewindConfig) -> None:
@@ -248,7 +248,7 @@ class SelfAttention(nn.Module):
 
 
 class EncoderLayer(nn.Module):
-    """Post-norm transformer layer with ReLU; parameters named as nn.TransformerEncoderLayer's."""
+    """Post-norm transformer layer with ReLU; parameter names follow nn.TransformerEncoderLayer."""
 
     def __init__(self, config: RewindConfig) -> None:
         super().__init__()
@@ -269,7 +269,7 @@ class EncoderLayer(nn.Module):
 
 
 class Encoder(nn.Module):
-    """A stack of EncoderLayer; the last computes only the tokens whose outputs are read."""
+    """A stack of EncoderLayer; the last one computes only the tokens whose outputs are read."""
 
     def __init__(self, config: RewindConfig) -> None:
         super().__init__()
@@ -310,7 +310,7 @@ class RewindTransformer(nn.Module):
             self.similarity_head = PredictionHead(width, 1)
 
     def forward(self, batch: RewindBatch) -> RewindOutput:
-        """Return the logits of every frame and query in the batch."""
+        """Return the logits for every frame and query in the batch."""
         hidden = self.transformer(self._tokens(batch), batch.packing, batch.read_at)
         num_frames, num_queries = len(batch.frame_at), len(batch.query_at)
         query = self._query_scores(hidden[num_frames : num_frames + num_queries], batch)
@@ -345,7 +345,7 @@ class RewindTransformer(nn.Module):
         return torch.where(batch.is_similarity[:, None], self.similarity_token[0], self.preference_token[0])
 
     def _query_scores(self, hidden: Tensor, batch: RewindBatch) -> Tensor:
-        """Return logits [Q] of the query tokens' states [Q, D]."""
+        """Return logits [Q] from the query tokens' states [Q, D]."""
         if not self.config.has_preference:
             return self.similarity_head(hidden).squeeze(-1) if self.config.has_similarity else hidden[:, 0]
         preference = self.preference_head(hidden).squeeze(-1)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Score samples of embeddings: samples -> rows -> packed batches -> scores.
+"""Score embedding samples: samples -> rows -> packed batches -> scores.
 
-A row is a token sequence of a forward pass. A sample has one row, in dense mode one for each frame.
+A row is a token sequence in a forward pass. A sample has one row, or one per frame in dense mode.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MAX_EMBEDDING = 1e6  # thousands of times an encoder's values
 
 @dataclass(frozen=True, eq=False)
 class RewindRow:
-    """A token sequence: of text [Dt], first [T, Dv] and, for preference or similarity, second [T, Dv].
+    """A token sequence: text [Dt], first [T, Dv] and, for preference or similarity, second [T, Dv].
 
     picked: in dense mode int64 [frame_steps], the frames of ``first`` in the row; None: all
     """
@@ -46,21 +46,21 @@ class RewindRow:
 
     @property
     def num_first(self) -> int:
-        """Frames of the first trajectory in the row."""
+        """How many frames the first trajectory has in the row."""
         return len(self.first if self.picked is None else self.picked)
 
     @property
     def num_second(self) -> int:
-        """Frames of the second trajectory in the row, or 0."""
+        """How many frames the second trajectory has in the row, or 0."""
         return 0 if self.second is None else len(self.second)
 
     @property
     def videos(self) -> tuple[Float32Array, ...]:
-        """The embeddings of the first trajectory and of the second, if there is a second."""
+        """The embeddings by trajectory: first and, if it exists, second."""
         return (self.first,) if self.second is None else (self.first, self.second)
 
     def shown(self, video: Float32Array) -> npt.NDArray[np.int64]:
-        """Return the indices of the frames of ``video`` (of ``videos``) in the row, int64 [T]."""
+        """Return which frames of ``video``, one of ``videos``, the row shows, int64 [T]."""
         return np.arange(len(video)) if self.picked is None else self.picked
 
 
@@ -71,7 +71,7 @@ class RewindCollator:
     config: RewindConfig
 
     def rows(self, sample: Sample) -> list[RewindRow]:
-        """Return the rows of a sample. Raises InvalidSampleError if the checkpoint cannot score it."""
+        """Return a sample's rows. Raises InvalidSampleError if the checkpoint cannot score the sample."""
         check_type(sample, self.config)
         frame_steps = sample.frame_steps if isinstance(sample, ProgressSample) else 0
         if sample.trajectories[0].video_embeddings is None:
@@ -85,7 +85,7 @@ class RewindCollator:
         return [RewindRow(text, videos[0], videos[1], isinstance(sample, SimilaritySample))]
 
     def collate(self, rows: Sequence[RewindRow]) -> RewindBatch:
-        """Return one batch of rows of any kinds. A frame that several rows show is in the batch once."""
+        """Return one batch with rows of any kind. The batch holds a frame once, even if several rows show it."""
         videos: dict[int, Float32Array] = {}
         starts: dict[int, int] = {}
         num_frames = 0
@@ -163,11 +163,11 @@ class RewindPredictor:
         return self.network.config.has_success
 
     def rows(self, sample: Sample) -> list[RewindRow]:
-        """Return the rows of a sample of embeddings. Raises InvalidSampleError."""
+        """Return the rows for an embedding sample. Raises InvalidSampleError."""
         return self.collator.rows(sample)
 
     def num_tokens(self, row: RewindRow) -> int:
-        """Return the number of tokens in the row."""
+        """Return how many tokens the row has."""
         return self.network.config.num_tokens(row.num_first, row.num_second)
 
     def sequences(self, row: RewindRow) -> Sequence[RewindRow]:
@@ -178,7 +178,7 @@ class RewindPredictor:
         """Do nothing: collation is cheap."""
 
     def collate(self, rows: Sequence[RewindRow]) -> RewindBatch:
-        """Return one batch of rows of any kinds."""
+        """Return one batch with rows of any kind."""
         return self.collator.collate(rows)
 
     def count(self, batch: RewindBatch, execution: Execution) -> None:
@@ -189,7 +189,7 @@ class RewindPredictor:
     def score(
         self, rows: Sequence[RewindRow], batch: RewindBatch, execution: Execution
     ) -> list[RowScores | RewardError]:
-        """Run one forward pass; return each row's scores, or its error."""
+        """Run one forward pass; return each row's scores or error."""
         output = self.network(batch.to(self.device, self.dtype))
         frames = frame_scores(output.progress, output.success)
         logits, probabilities = output.query.float().tolist(), output.query.sigmoid().float().tolist()
@@ -208,5 +208,5 @@ class RewindPredictor:
         return list(scored)
 
     def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
-        """Return the scores of a progress sample's frames, from those of all its rows."""
+        """Return frame scores for a progress sample, joined from all its rows."""
         return of_rows(sample, rows)

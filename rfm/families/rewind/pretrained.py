@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Load the files of ReWiND's encoders in transformers' format: settings, preprocessing, tokenizer, weights."""
+"""Load ReWiND encoder files in transformers' format: settings, preprocessing, tokenizer, weights."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from rfm.files import (
 from rfm.weights import check_values
 from rfm_client.contract.description import FrameSize
 
-IMAGE_MODELS = ("dinov2", "dinov2_with_registers")  # types whose pooled output is that of the class token
-TEXT_MODELS = ("bert", "distilbert", "mpnet", "roberta", "xlm-roberta")  # types of sentence encoders
+IMAGE_MODELS = ("dinov2", "dinov2_with_registers")  # types whose pooled output is the class token's
+TEXT_MODELS = ("bert", "distilbert", "mpnet", "roberta", "xlm-roberta")  # sentence encoder types
 _LOADING_PROBLEMS = ("missing_keys", "unexpected_keys", "mismatched_keys")  # as transformers reports a load
 
 
@@ -36,7 +36,7 @@ class ImagePreprocessor:
     """uint8 images -> normalised crops, bit-exact with transformers' "fast" (torchvision) Bit image processor.
 
     Resizes the shorter side to ``resize_px`` (bicubic, antialiased, on uint8), crops the centre to ``crop_px`` =
-    (height, width), then computes (value - 255 mean) / (255 std) for each channel.
+    (height, width), then computes (value - 255 mean) / (255 std) per channel.
     """
 
     resize_px: int
@@ -51,7 +51,7 @@ class ImagePreprocessor:
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], where: str) -> ImagePreprocessor:
-        """Read the content of preprocessor_config.json. Raises ValueError for other steps."""
+        """Read preprocessor_config.json's content. Raises ValueError for other steps."""
         size: Any = config.get("size")
         crop: Any = config.get("crop_size")
         if _is_count(size) and str(config.get("image_processor_type", "Bit")).startswith(("Bit", "CLIP")):
@@ -85,7 +85,7 @@ class ImagePreprocessor:
         )
 
     def to_config(self) -> dict[str, Any]:
-        """Return the fields of preprocessor_config.json that ``from_config`` reads."""
+        """Return the preprocessor_config.json fields that ``from_config`` reads."""
         return {
             "do_resize": True,
             "size": {"shortest_edge": self.resize_px},
@@ -145,9 +145,9 @@ def _has_counts(value: Any, *names: str) -> bool:
 
 
 def load_config(source: str | Path, known: Sequence[str]) -> Any:
-    """Load the configuration of a model's folder or id.
+    """Load a model's configuration from its folder or id.
 
-    known: the accepted types of models
+    known: accepted model types
     Raises OSError, CheckpointError, and ValueError for another type.
     """
     from transformers import AutoConfig
@@ -160,7 +160,7 @@ def load_config(source: str | Path, known: Sequence[str]) -> Any:
 
 
 def load_preprocessor(source: str | Path) -> ImagePreprocessor:
-    """Load the preprocessing of an image model. Raises OSError, ValueError, CheckpointError."""
+    """Load an image model's preprocessing. Raises OSError, ValueError, CheckpointError."""
     file = local_copy(source) / PREPROCESSOR_CONFIG
     if not is_there(file):
         raise OSError(f"{source}: expected {PREPROCESSOR_CONFIG}, got none")
@@ -169,7 +169,7 @@ def load_preprocessor(source: str | Path) -> ImagePreprocessor:
 
 
 def load_tokenizer(source: str | Path, vocab_size: int) -> Any:
-    """Load the tokenizer of a text model with ``vocab_size`` token embeddings. Raises OSError and ValueError."""
+    """Load the tokenizer for a text model with ``vocab_size`` token embeddings. Raises OSError and ValueError."""
     from transformers import AutoTokenizer
 
     expected = "files of a tokenizer (tokenizer.json, or vocab.txt), got none that can be read"
@@ -185,11 +185,11 @@ def load_tokenizer(source: str | Path, vocab_size: int) -> Any:
 
 
 def load_model(source: str | Path, weights: Mapping[str, Tensor] | None, known: Sequence[str]) -> Any:
-    """Load the model of ``source``, with ``weights`` in place of its own if given.
+    """Load the model from ``source``; ``weights``, if given, replace its own.
 
     transformers loads the weights, since it knows how their names changed between releases.
 
-    known: the accepted types of models
+    known: accepted model types
     Raises OSError, CheckpointError, and ValueError for another type or for weights that do not fit exactly.
     """
     from transformers import AutoModel

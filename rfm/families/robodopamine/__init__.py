@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Robo-Dopamine GRM: a Qwen-VL writes how far the images AFTER are from those BEFORE, in percent."""
+"""Robo-Dopamine GRM: a Qwen-VL writes how far the AFTER images are from the BEFORE images, in percent."""
 
 from rfm.engine.family import Family
 from rfm.families.robodopamine.checkpoint import RoboDopamineCheckpoint

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The frames that Robo-Dopamine is asked about, and what its answers mean.
+"""Which frames Robo-Dopamine compares, and what its answers mean.
 
-An answer says how far the images AFTER are from those BEFORE, in percent: ``<score>+37%</score>``. Each sampled frame
-but the first is AFTER in one question of a mode; BEFORE is the sampled frame before it (incremental, benchmark),
-frame 0 (forward), or the goal (backward). Sources: ``examples/inference.py`` and, for ``benchmark``,
-``eval/evaluation_grm.py`` of ``FlagOpen/Robo-Dopamine``.
+An answer says how far the images AFTER are from those BEFORE, in percent: ``<score>+37%</score>``. Every sampled frame
+except the first is AFTER in one question per mode; BEFORE is the previous sampled frame (incremental, benchmark), frame
+0 (forward), or the goal (backward). Sources: ``examples/inference.py`` and, for ``benchmark``,
+``eval/evaluation_grm.py`` in ``FlagOpen/Robo-Dopamine``.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ def sampled_frames(num_frames: int, interval: int) -> Indices:
 
 
 def parsed(answer: str) -> float | None:
-    """Return the score in an answer, -1..1; None: it holds no score.
+    """Return the score in an answer, -1..1; None: the answer holds no score.
 
-    Read as the original reads it: the text behind the last ``<score>``, up to the first ``</score>``, without ``%``, as
-    Python's ``float``. The original takes an unreadable answer for 0, and ``nan`` for 1.
+    Parses like the original: the text behind the last ``<score>``, up to the first ``</score>``, without ``%``, as
+    Python's ``float``. The original takes an unreadable answer as 0, and ``nan`` as 1.
     """
     text = answer.rpartition(BEGIN)[2].partition(END)[0]
     try:
@@ -55,8 +55,8 @@ def parsed(answer: str) -> float | None:
 def fused(scores: Sequence[float], question: Question) -> list[float]:
     """Return the progress at each frame AFTER, from the scores in order.
 
-    As in the original, progress is not clipped: a score of the wrong sign leaves 0..1. In ``benchmark`` it stays
-    within, since the first step begins at 0. The first step of ``incremental`` is the score itself.
+    As in the original, progress is not clipped: a score with the wrong sign leaves 0..1. In ``benchmark`` it stays
+    inside, since the first step begins at 0. The first step in ``incremental`` is the score itself.
     """
     if question == "forward":
         return [*scores]
@@ -72,7 +72,7 @@ def fused(scores: Sequence[float], question: Question) -> list[float]:
 
 
 def hops(scores: Sequence[float], question: Question) -> list[float]:
-    """Return the change at each frame AFTER: the score itself if BEFORE was the frame before, else that of progress."""
+    """Return each frame's change: the score if BEFORE was the previous frame, otherwise the change in progress."""
     if question in ("incremental", "benchmark"):
         return [*scores]
     progress = fused(scores, question)

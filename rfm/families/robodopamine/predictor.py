@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The predictor of Robo-Dopamine: reads the scores of pairs of frames, and makes progress of them."""
+"""The Robo-Dopamine predictor: reads the scores for frame pairs, and computes progress from them."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class RoboDopaminePredictor(WritingPredictor):
     expected = "a score in percent, as <score>+37%</score>, in the model's answer"
 
     def read(self, text: str, answer: WrittenAnswer, row: VlmRow, execution: Execution) -> RowScores | None:
-        """Return the score in an answer as if it were progress; None: it cannot be read."""
+        """Return the score in an answer as if it were progress; None: the answer cannot be read."""
         score = parsed(text)
         return None if score is None else progress_of(score)
 
     def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
-        """Return progress and its changes at the sampled frames but the first; NaN: the frame has no answer."""
+        """Return progress and its changes at the sampled frames except the first; NaN: no answer for the frame."""
         config, num_frames = self.collator.config, sample.trajectories[0].num_frames
         questions = QUESTIONS[config.mode]
         scores = np.array([row.frames[0].progress[0] for row in rows], np.float64).reshape(len(questions), -1).tolist()

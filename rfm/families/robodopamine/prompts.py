@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Settings, prompts and images of Robo-Dopamine: eight images for each pair of frames.
+"""Settings, prompts and images for Robo-Dopamine: eight images per frame pair.
 
-Sources: ``examples/inference.py`` of ``FlagOpen/Robo-Dopamine``; ``robometer/evals/baselines/robodopamine.py``, which
+Sources: ``examples/inference.py`` in ``FlagOpen/Robo-Dopamine``; ``robometer/evals/baselines/robodopamine.py``, which
 has one camera and no goal.
 """
 
@@ -28,9 +28,9 @@ from rfm_client.contract import InvalidSampleError, Sample, Trajectory
 from rfm_client.contract.samples import UInt8Array
 
 IMAGE = VISION_START + IMAGE_PAD + VISION_END
-PLACEHOLDER = "<image>"  # of an image in the originals' prompts
-Images: TypeAlias = Sequence[tuple[VlmVideo, int]]  # video and index of each image, in the prompt's order
-GOAL_SIDE_PX, GOAL_GREY = 224, 128  # of a sample without a goal
+PLACEHOLDER = "<image>"  # for an image in the originals' prompts
+Images: TypeAlias = Sequence[tuple[VlmVideo, int]]  # the images' videos and indices, in the prompt's order
+GOAL_SIDE_PX, GOAL_GREY = 224, 128  # for a sample without a goal
 NUM_WRISTS = 2
 PARTS = (
     """
@@ -82,15 +82,16 @@ Return ONLY one line containing the score wrapped in <score> tags, as an integer
 <score>+NN%</score>  or  <score>-NN%</score>  or  <score>0%</score>
 """,  # noqa: E501
 )
-NUM_IMAGES = len(PARTS) - 1  # of a question
+NUM_IMAGES = len(PARTS) - 1  # per question
 
 
 @dataclass(frozen=True)
 class RoboDopamineConfig(WritingConfig):
     """The configuration of Robo-Dopamine.
 
-    least_px, most_px: of an image
-    mode: what each frame is compared with, and how progress is made of it; mean: that of incremental, forward, backward
+    least_px, most_px: pixels per image
+    mode: what frames are compared with, and how progress follows from that; mean: average over incremental, forward,
+        backward
     interval: frames from one compared frame to the next; the last is always compared
     """
 
@@ -104,7 +105,7 @@ class RoboDopamineConfig(WritingConfig):
     multi_image: ClassVar[bool] = True
 
     def check(self) -> None:
-        """Raise CheckpointError for a setting of the user that makes no sense."""
+        """Raise CheckpointError for a user's setting that makes no sense."""
         if self.mode not in QUESTIONS:
             raise CheckpointError.at("--as: mode", f"one of {', '.join(QUESTIONS)}", repr(self.mode))
         if self.interval < 1:
@@ -119,12 +120,12 @@ class ImagesRow(VlmRow):
 
     @property
     def shown(self) -> Iterator[tuple[VlmVideo, Indices]]:
-        """Each image's video, and its index there."""
+        """The images' videos and indices."""
         return ((video, np.array([frame])) for video, frame in self.images)
 
 
 class RoboDopamineCollator(WritingCollator):
-    """The collator of Robo-Dopamine: a conversation for each pair of frames and mode."""
+    """The collator for Robo-Dopamine: one conversation per frame pair and mode."""
 
     images: BoundedImages
 
@@ -133,7 +134,7 @@ class RoboDopamineCollator(WritingCollator):
         self._text = lru_cache(KEPT_TEXTS)(self._task_text)
 
     def example(self) -> str:
-        """Return the prompt of an example task."""
+        """Return the prompt for an example task."""
         return self._text("TASK")
 
     def check_template(self) -> None:
@@ -143,13 +144,13 @@ class RoboDopamineCollator(WritingCollator):
             raise CheckpointError.at("chat template", f"{NUM_IMAGES} images in a prompt", got)
 
     def num_patches(self, video: VlmVideo) -> int:
-        """Return the number of patches of a video's frames that are shown."""
+        """Return how many patches a video's shown frames have."""
         return super().num_patches(video) * len(video.conversations)
 
     def _questions(self, text: str, asked: Sequence[Images]) -> list[VlmRow]:
-        """Return the rows of questions whose images have equal sizes, so that they have equal tokens.
+        """Return the rows for questions whose images have equal sizes and therefore equal tokens.
 
-        text: the chat template's
+        text: text from the chat template
         """
         grids = [self.grid(video) for video, _ in asked[0]]
         ids = expanded(self._chat.tokens(text), self.visual_pad, [grid.tokens_per_group for grid in grids])
@@ -170,7 +171,7 @@ class RoboDopamineCollator(WritingCollator):
             raise InvalidSampleError.at("task", f"text without {PLACEHOLDER}", repr(task))
 
     def rows(self, sample: Sample) -> list[VlmRow]:
-        """Return the conversations of a progress sample, those of each mode in the order of frames.
+        """Return a progress sample's conversations, mode by mode, in frame order.
 
         Raises InvalidSampleError.
         """
@@ -196,7 +197,7 @@ class RoboDopamineCollator(WritingCollator):
             raise InvalidSampleError.at("views", expected, str(len(trajectory.views)))
 
     def _task_text(self, task: str) -> str:
-        """Return the chat template's text of a question, with an image between each two of PARTS."""
+        """Return the chat template's text for a question, with an image between consecutive PARTS."""
         content: list[dict[str, str]] = []
         for part in PARTS:
             content += [{"type": "image"}] * bool(content)
@@ -210,13 +211,13 @@ def _different(images: Images) -> tuple[VlmVideo, ...]:
 
 
 def each_alone(frames: Sequence[UInt8Array] | UInt8Array, shown: Indices, named: Any = None) -> VlmVideo:
-    """Return a video of which each frame in ``shown``, int64 [N], is an image. named: as in ``VlmVideo``"""
+    """Return a video in which each frame in ``shown``, int64 [N], is an image. named: as in ``VlmVideo``."""
     return VlmVideo(frames, 1, [np.array([frame]) for frame in shown], named)
 
 
 @dataclass(frozen=True, eq=False)
 class Videos:
-    """The images of a sample, of which a question shows eight."""
+    """A sample's images, eight of which appear in a question."""
 
     front: VlmVideo
     goal: VlmVideo
@@ -224,7 +225,7 @@ class Videos:
 
     @classmethod
     def of(cls, trajectory: Trajectory, compared: Indices) -> Videos:
-        """Return the images of a trajectory of which the frames ``compared`` are read."""
+        """Return a trajectory's images, where only the frames ``compared`` are read."""
         grey = np.full((GOAL_SIDE_PX, GOAL_SIDE_PX, 3), GOAL_GREY, np.uint8)
         goal = grey if trajectory.goal is None else trajectory.goal
         video = video_of(trajectory, 0)
@@ -234,7 +235,7 @@ class Videos:
         return cls(front, each_alone(goal[np.newaxis], np.array([0])), (left, right))
 
     def images(self, question: Question, before: int, after: int) -> list[tuple[VlmVideo, int]]:
-        """Return the video and index of each image of a question: the task's start and end, BEFORE, AFTER.
+        """Return video and index for all images in a question: the task's start and end, BEFORE, AFTER.
 
         before: the frame compared before ``after``
         """

@@ -28,8 +28,8 @@ from rfm_client.contract.description import Description
 class VlmCheckpoint(QwenCheckpoint):
     """A vision-language checkpoint in memory.
 
-    weights: of VlmRewardModel, without LoRA
-    factors: of LoRA, with the names of ``rfm.qwen.lora.split``; empty without LoRA
+    weights: for VlmRewardModel, without LoRA
+    factors: LoRA factors, named as by ``rfm.qwen.lora.split``; empty without LoRA
     """
 
     network_of = VlmRewardModel
@@ -62,7 +62,7 @@ class VlmCheckpoint(QwenCheckpoint):
         return {NETWORK: self.weights, LORA: self.factors}
 
     def load_collator(self) -> VlmCollator:
-        """Return the collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
+        """Return the sample collator. Raises CheckpointError if the processor is missing or does not fit."""
         embedding = next(t for name, t in self.weights.items() if name.endswith("embed_tokens.weight"))
         return load_collator(self.config, len(embedding), self.processor)
 
@@ -89,9 +89,9 @@ def frame_size(config: VlmConfig) -> FrameSize | None:
 
 
 def load_collator(config: VlmConfig, num_tokens: int, processor: str | Path) -> VlmCollator:
-    """Load the collator of a checkpoint. Raises CheckpointError for a processor that is missing or does not fit.
+    """Load a checkpoint's collator. Raises CheckpointError for a processor that is missing or does not fit.
 
-    num_tokens: rows of the checkpoint's token embedding
+    num_tokens: rows in the checkpoint's token embedding
     processor: folder or id with tokenizer and image preprocessing
     """
     tokenizer, preprocessor = read_processor(processor, videos=not config.multi_image)

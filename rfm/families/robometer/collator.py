@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The conversations of RFM and Robometer, whose tokens equal those of upstream's inference collator."""
+"""The conversations for RFM and Robometer, with the same tokens as in upstream's inference collator."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ from rfm_client.contract import ProgressSample, Sample, SimilaritySample
 
 
 class VlmCollator(QwenCollator):
-    """The collator of RFM and Robometer, whose tokens equal those of upstream's inference collator."""
+    """The collator for RFM and Robometer, with the same tokens as upstream's inference collator."""
 
     def rows(self, sample: Sample) -> list[VlmRow]:
-        """Return the conversations of a sample. Raises InvalidSampleError if the checkpoint cannot score it."""
+        """Return a sample's conversations. Raises InvalidSampleError if the checkpoint cannot score the sample."""
         check_type(sample, self.config)
         frame_steps = sample.frame_steps if isinstance(sample, ProgressSample) else 0
         videos = tuple(video_of(trajectory, frame_steps) for trajectory in sample.trajectories)
         self._check_task(sample.trajectories[0].task)
         row = self._row(sample, videos)
         if frame_steps:
-            # All prefixes show equally many frames of equal size, so all conversations have the same tokens.
+            # All prefixes show equally many frames with the same size, so all conversations have the same tokens.
             return [replace(row, picked=picked) for picked in videos[0].conversations]
         return [row]
 
@@ -67,7 +67,7 @@ class VlmCollator(QwenCollator):
         return each * num_frames
 
     def _image_spans(self, ids: Indices, videos: tuple[VlmVideo, ...], ends: Spans) -> tuple[Spans, ...]:
-        """Return the spans of frames that are separate images; ``ends``: the tokens around each image."""
+        """Return the token spans for frames that are separate images; ``ends``: the tokens around each image."""
         if self.config.per_frame_progress_token:
             spans = [(int(token), int(token) + 1) for token in self._positions(ids, PROGRESS_TOKEN)]
         elif self.config.frame_pooling == "boundary":

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Reward heads on a vision-language backbone of ``transformers``: RFM and Robometer checkpoints.
+"""Reward heads on a vision-language backbone from ``transformers``: RFM and Robometer checkpoints.
 
-F frames (in video mode: temporal patches) and Q queries of all rows, L tokens, D width, K progress bins.
-The heads read the last hidden states, behind the final norm: of a frame, pooled over a span of tokens, and of a query,
+F frames (in video mode: temporal patches) and Q queries in all rows, L tokens, width D, K progress bins.
+The heads read the last hidden states, behind the final norm: for a frame, pooled over a token span; for a query,
 at its token.
 """
 
@@ -52,12 +52,12 @@ class VlmConfig(BackboneConfig):
 
     @property
     def pools_images(self) -> bool:
-        """True if an image's tokens are pooled by ``frame_pooling``, which upstream uses only for images."""
+        """True if ``frame_pooling`` pools an image's tokens; upstream uses it only for images."""
         return self.multi_image and not self.per_frame_progress_token
 
     @property
     def pools_by_attention(self) -> bool:
-        """True if the attention of frame_pool_attn weighs an image's tokens."""
+        """True if frame_pool_attn's attention weighs an image's tokens."""
         return self.pools_images and self.frame_pooling == "attention"
 
 
@@ -76,7 +76,7 @@ class VlmOutput:
 
 
 class VlmRewardModel(nn.Module):
-    """Backbone and heads, with upstream's names of the heads."""
+    """Backbone and heads, with upstream's head names."""
 
     graphs: Graphs | None = None
 
@@ -95,7 +95,7 @@ class VlmRewardModel(nn.Module):
         self.frame_pool_attn = nn.Linear(width, 1, bias=False)
 
     def forward(self, batch: VlmBatch) -> VlmOutput:
-        """Return the logits of every frame and query in the batch, which is on the network's device."""
+        """Return the logits for every frame and query in a batch on the network's device."""
         hidden, made = qwen_states(self.model, batch, graphs=self.graphs)
         frames = self._frame_states(hidden, batch.spans, batch.num_span_tokens)
         queries = hidden[batch.query_rows, batch.query_tokens]
@@ -108,9 +108,9 @@ class VlmRewardModel(nn.Module):
         )
 
     def _frame_states(self, hidden: Tensor, spans: Tensor, num_tokens: int) -> Tensor:
-        """Return each span's pooled state, [F, D].
+        """Return the pooled state per span, [F, D].
 
-        The spans are packed one after the other, [num_tokens, D], so that a long span adds no padding to the others.
+        Spans are packed one after the other, [num_tokens, D], so that a long span adds no padding to the others.
         """
         rows, starts, stops = spans.unbind(dim=1)
         lengths = stops - starts
@@ -125,13 +125,13 @@ class VlmRewardModel(nn.Module):
 
 
 def _of_each(reduction: str, values: Tensor, lengths: Tensor) -> Tensor:
-    """Return the sum or maximum of each segment, float32 [N, ...] -> [F, ...]."""
-    # unsafe: without a check of the lengths, for which the host would wait
+    """Return the sum or maximum per segment, float32 [N, ...] -> [F, ...]."""
+    # unsafe: skips the length check, for which the host would wait
     return torch.segment_reduce(values, reduction, lengths=lengths, axis=0, unsafe=True)
 
 
 def _softmax_of_each(scores: Tensor, lengths: Tensor, segment: Tensor) -> Tensor:
-    """Return the softmax within segments, [N] -> [N], computed in float32; ``segment``: index for each value."""
+    """Return the softmax within segments, [N] -> [N], computed in float32; ``segment``: segment index per value."""
     largest = _of_each("max", scores.float(), lengths)
     weights = (scores.float() - largest[segment]).exp()
     return (weights / _of_each("sum", weights, lengths)[segment]).to(scores.dtype)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The predictor of RFM and Robometer: the scores of frames and pairs, from one forward pass."""
+"""The RFM and Robometer predictor: scores for frames and pairs, from one forward pass."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class VlmPredictor(QwenPredictor):
 
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
-        """Run one forward pass; return each row's scores, or its error."""
+        """Run one forward pass; return each row's scores or error."""
         output = self._output(batch)
         scores, preference, similarity, may_keep = _read(output)
         of_rows, read, num_queries = [], 0, 0
@@ -47,14 +47,14 @@ class VlmPredictor(QwenPredictor):
         return list(of_rows)
 
     def _per_frame(self, scores: FrameScores, num_frames: int) -> FrameScores:
-        """Return the scores of each frame; in video mode both frames of a temporal patch share its score."""
+        """Return the scores by frame; in video mode both frames in a temporal patch share a score."""
         if self.network.config.multi_image:
             return scores
         return scores.at(np.arange(num_frames) // FRAMES_PER_GROUP)
 
 
 def _read(output: VlmOutput) -> tuple[FrameScores, list[float], list[float], bool]:
-    """Return scores of all frames, preferences, similarities, and True if this pass's new features are finite.
+    """Return all frames' scores, preferences, similarities, and True if this pass's new features are finite.
 
     A single copy from the device reads them all.
     """

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The exact prompts of vision-language checkpoints: scores depend on the wording.
+"""The exact prompts for vision-language checkpoints: scores depend on the wording.
 
 A question is a list of parts in reading order: text and whole trajectories. The chat template turns it into text, the
 tokenizer the text into tokens.
-Source: the collators of ``reward_fm`` and ``robometer``.
+Source: the collators in ``reward_fm`` and ``robometer``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SIMILARITY_TOKEN = "<|sim_token|>"
 PROGRESS_TOKEN = "<|prog_token|>"
 # In the order in which the tokenizer gets them.
 SPECIAL_TOKENS = (SPLIT_TOKEN, REWARD_TOKEN, PREFERENCE_TOKEN, SIMILARITY_TOKEN, PROGRESS_TOKEN)
-OLD_SPECIAL_TOKENS = 8  # number of upstream's special tokens before 2026-01-21
+OLD_SPECIAL_TOKENS = 8  # upstream's special token count before 2026-01-21
 OF_AN_OLD_RUN = (
     "upstream's networks have it since 2026-01-21. A run of before that day was trained with 8 special tokens in place "
     "of 5, and with resized images; score it with the upstream commit that trained it, or train it anew"
@@ -46,7 +46,7 @@ SIMILARITY_PROMPT = (
 
 @dataclass(frozen=True)
 class TrajectoryPart:
-    """The place of the frames of trajectory ``index`` (0 or 1) in a question."""
+    """The place in a question where the frames of trajectory ``index`` (0 or 1) appear."""
 
     index: int
 
@@ -55,7 +55,7 @@ Part: TypeAlias = str | TrajectoryPart
 
 
 def question(sample: Sample, *, progress_in_preference: bool) -> list[Part]:
-    """Return the parts of the prompt for a sample.
+    """Return the prompt parts for a sample.
 
     progress_in_preference: the checkpoint was trained with preference prompts that also ask for progress
     """

@@ -17,7 +17,7 @@ from rfm_client.contract.description import Description
 
 @dataclass(frozen=True)
 class RoboRewardCheckpoint(LanguageCheckpoint):
-    """A checkpoint of RoboReward in memory."""
+    """A RoboReward checkpoint in memory."""
 
     made_of = RoboRewardConfig
     predictor_of = RoboRewardPredictor

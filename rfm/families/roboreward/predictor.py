@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The predictor of RoboReward: reads the scores in written answers, or computes their expected values."""
+"""The RoboReward predictor: reads the scores in written answers, or computes their expected values."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class RoboRewardPredictor(WritingPredictor):
 
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
-        """Return each row's scores, or its error.
+        """Return each row's scores or error.
 
         execution: its ``on_forward`` is called after each forward pass
         """
@@ -41,7 +41,7 @@ class RoboRewardPredictor(WritingPredictor):
     def read(
         self, text: str, answer: WrittenAnswer, row: VlmRow, execution: Execution
     ) -> RowScores | RewardError | None:
-        """Return the scores in an answer, or its error; None: it cannot be read."""
+        """Return the scores in an answer, or its error; None: the answer cannot be read."""
         score = parsed(text)
         if score is None:
             return None
@@ -56,7 +56,7 @@ class RoboRewardPredictor(WritingPredictor):
 def _scores(
     progress: float, logits: Float32Array, row: VlmRow, *, unclear: bool | None = None
 ) -> RowScores | RewardError:
-    """Return the same scores for each frame of a row. unclear: None: no answer is written"""
+    """Return the same scores for all frames in a row. unclear: None: no answer is written."""
     num_frames = row.videos[0].num_shown
     of_frames = np.full(num_frames, progress, np.float32)
     frames = FrameScores(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The prompt, the frames and the answers of RoboReward. Source: ``robometer/evals/baselines/roboreward.py``."""
+"""The prompt, frames and answers for RoboReward. Source: ``robometer/evals/baselines/roboreward.py``."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SCORES = (1, 2, 3, 4, 5)
 JPEG_QUALITY = 85
 _ANSWER = re.compile(r"ANSWER:\s*(\d+)", re.IGNORECASE)
 _ALONE = re.compile(r"\b([1-5])\b")
-# What follows each ANSWER, up to the end of its sentence, and the numbers in it: 4, but also 1.5, 3/5, -2 and 4-5.
+# What follows ANSWER, up to its sentence's end, and the numbers there: 4, but also 1.5, 3/5, -2 and 4-5.
 _STATED = re.compile(r"ANSWER:\s*(.*?)(?=[.;!?]\s|[.;!?]?$|ANSWER:)", re.IGNORECASE | re.MULTILINE)
 _NUMBER = re.compile(r"[+-]?\d+(?:[.,/:-]\d+)*%?")
 
@@ -42,8 +42,8 @@ _NUMBER = re.compile(r"[+-]?\d+(?:[.,/:-]\d+)*%?")
 class RoboRewardConfig(WritingConfig):
     """The configuration of RoboReward.
 
-    is_expected: the answer is not written: its expected value over the five digits is the score
-    strict_answers: an unclear answer is an error; else its score is marked
+    is_expected: no answer is written; the score is the expected value over the five digits
+    strict_answers: an unclear answer is an error; otherwise its score is marked
     """
 
     is_expected: bool = False
@@ -53,7 +53,7 @@ class RoboRewardConfig(WritingConfig):
 
 
 class RoboRewardCollator(WritingCollator):
-    """The collator of RoboReward: one conversation about all frames, in dense mode one for each prefix."""
+    """The collator for RoboReward: one conversation about all frames, or one per prefix in dense mode."""
 
     config: RoboRewardConfig
 
@@ -62,7 +62,7 @@ class RoboRewardCollator(WritingCollator):
         self.digits = [int(tokenizer.convert_tokens_to_ids(str(score))) for score in SCORES]
 
     def example(self) -> str:
-        """Return the prompt of an example task, with VIDEO in the place of the video."""
+        """Return the prompt for an example task, with VIDEO as placeholder."""
         return self.template(PROMPT, add_generation_prompt=True) + BEFORE_ANSWER * self.config.is_expected
 
     def prompts(self, video: VlmVideo, task: str) -> list[VlmRow]:
@@ -82,7 +82,7 @@ class RoboRewardCollator(WritingCollator):
 def as_jpeg(frame: UInt8Array) -> UInt8Array:
     """Return a frame, uint8 [H, W, 3], after a round trip through JPEG.
 
-    The original also optimises the Huffman tables, which takes half of the time and changes no pixel.
+    The original also optimises the Huffman tables, which takes half the time and changes no pixel.
     """
     from PIL import Image
 
@@ -93,7 +93,7 @@ def as_jpeg(frame: UInt8Array) -> UInt8Array:
 
 
 def parsed(answer: str) -> int | None:
-    """Return the score in an answer: the number behind ANSWER, else the last digit alone; None: there is none."""
+    """Return the score in an answer: the number behind ANSWER, otherwise the last lone digit; None: there is none."""
     found = _ANSWER.search(answer)
     if found is not None and int(found[1]) in SCORES:
         return int(found[1])
@@ -102,6 +102,6 @@ def parsed(answer: str) -> int | None:
 
 
 def is_unclear(answer: str, score: int) -> bool:
-    """True unless an answer states one number, the score that ``parsed`` found, behind ANSWER or at all."""
+    """True unless the only number that an answer states, behind ANSWER or anywhere, is the score ``parsed`` found."""
     stated = _STATED.findall(answer) or [answer]
     return any(_NUMBER.findall(text) != [str(score)] for text in stated)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""RynnValue: a Qwen3-VL with heads that predict the remaining seconds of a task at each frame."""
+"""RynnValue: a Qwen3-VL with heads that predict at each frame how many seconds the task still takes."""
 
 from rfm.engine.family import Family
 from rfm.families.rynnvalue.checkpoint import RynnCheckpoint

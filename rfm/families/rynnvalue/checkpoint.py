@@ -19,7 +19,7 @@ TRAINED_FRAMES = 8
 
 @dataclass(frozen=True)
 class RynnCheckpoint(LanguageCheckpoint):
-    """A RynnValue in memory."""
+    """A RynnValue model in memory."""
 
     made_of = RynnConfig
     network_of = RynnNetwork
@@ -39,13 +39,13 @@ class RynnCheckpoint(LanguageCheckpoint):
             more_scores=("remaining_s", "relative_s", "entropy"),
             asks_in_words=True,
             keeps_features=True,
-            uses_graphs=self.config.attention == "causal",  # else the groups need a mask
+            uses_graphs=self.config.attention == "causal",  # otherwise the groups need a mask
             is_large=True,
         )
 
     @property
     def own_tokens(self) -> dict[str, int]:
-        """The ids of the value tokens."""
+        """The value tokens and their ids."""
         return {VALUE_TOKEN: self.config.value_token, RELATIVE_TOKEN: self.config.relative_token}
 
     def make_collator(  # type: ignore[override]  # the prompts of the others have one video

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The heads of RynnValue on a Qwen3-VL, and the seconds that their logits mean.
+"""RynnValue's heads on a Qwen3-VL, and how their logits become seconds.
 
-A group is the copies of one value token behind a frame; a head reads their hidden states side by side. G groups, R
-copies in each, D width, K bins. Source: ``rynn_value`` of ``alibaba-damo-academy/RynnValue``.
+A group is a run of copies of one value token behind a frame; a head reads their hidden states side by side. G groups, R
+copies per group, width D, K bins. Source: ``rynn_value`` in ``alibaba-damo-academy/RynnValue``.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ _LEAST_PROBABILITY = 1e-8  # added before the logarithm of the entropy
 
 @dataclass(frozen=True)
 class Bins:
-    """The seconds of a head's bins.
+    """The seconds that a head's bins stand for.
 
     count: K
     transform: symlog and linear bins lie evenly, from ``least_s`` to ``most_s``; quantile bins between ``edges_s``
-    edges_s: K + 1 edges of quantile bins; None: other bins
+    edges_s: K + 1 edges for quantile bins; None: other bins
     """
 
     count: int
@@ -51,7 +51,7 @@ class Bins:
 
     @cached_property
     def centres(self) -> Tensor:
-        """float32 [K]: seconds, of symlog bins their symmetric logarithm."""
+        """float32 [K]: seconds; for symlog bins, their symmetric logarithm."""
         if self.edges_s is not None:
             edges = torch.tensor(self.edges_s)
             return (edges[:-1] + edges[1:]) * 0.5
@@ -68,14 +68,14 @@ class Bins:
 
 
 def entropy(logits: Tensor) -> Tensor:
-    """Return the entropy of the bins' probabilities in nats, float32: [..., K] -> [...]."""
+    """Return the entropy of the bin probabilities in nats, float32: [..., K] -> [...]."""
     probabilities = logits.float().softmax(-1)
     return -(probabilities * (probabilities + _LEAST_PROBABILITY).log()).sum(-1)
 
 
 @dataclass(frozen=True)
 class HeadConfig:
-    """The layers of a head: one (``linear``), or ``depth`` residual blocks of width ``width`` (``bro``)."""
+    """The layers in a head: one (``linear``), or ``depth`` residual blocks with width ``width`` (``bro``)."""
 
     kind: Literal["linear", "bro"]
     width: int
@@ -85,16 +85,16 @@ class HeadConfig:
 
 @dataclass(frozen=True)
 class RynnConfig(LanguageConfig):
-    """The configuration of a RynnValue.
+    """The configuration of a RynnValue model.
 
-    attention: isolated: the tokens of a group see each other, and no other token sees them; causal: they are ordinary
+    attention: isolated: the tokens in a group see each other, and no other token sees them; causal: they are ordinary
         tokens
     value_token, relative_token: ids of the tokens behind a frame
-    value_copies, relative_copies: R, number of copies of each
-    num_heads: of the remaining seconds; their mean is the score
+    value_copies, relative_copies: R, copies per group
+    num_heads: heads for the remaining seconds; their mean is the score
     use_meta: the prompt names the robot and the camera
     robot_description, camera_description: their words in the prompt; None: not named
-    least_px, most_px: of a frame after resizing
+    least_px, most_px: pixels per frame after resizing
     causal_mask: always True: no frame's value depends on later frames, so one pass scores every prefix
     """
 
@@ -120,20 +120,20 @@ class RynnConfig(LanguageConfig):
 
     @classmethod
     def fields_of(cls, settings: dict[str, Any]) -> dict[str, Any]:
-        """Return the fields of this class from an export's settings."""
+        """Return this class's fields from an export's settings."""
         fields = {**settings}
         parts = {"value_head": HeadConfig, "relative_head": HeadConfig, "value_bins": Bins, "relative_bins": Bins}
         for name, made in parts.items():
             values = {key: tuple(each) if isinstance(each, list) else each for key, each in fields[name].items()}
             fields[name] = made(**values)
-        for name in ("robot", "camera"):  # in exports of 0.4
+        for name in ("robot", "camera"):  # in exports from 0.4
             if name in fields:
                 fields[f"{name}_description"] = fields.pop(name)
         return fields
 
 
 class BroBlock(nn.Module):
-    """A residual block of a ``bro`` head."""
+    """A residual block in a ``bro`` head."""
 
     def __init__(self, config: HeadConfig) -> None:
         super().__init__()
@@ -149,7 +149,7 @@ class BroBlock(nn.Module):
 
 
 class BroHead(nn.Module):
-    """States of a group -> logits, through residual blocks."""
+    """A group's states -> logits, through residual blocks."""
 
     def __init__(self, config: HeadConfig, num_inputs: int, num_bins: int) -> None:
         super().__init__()
@@ -169,7 +169,7 @@ class BroHead(nn.Module):
 
 
 class ValueHead(nn.Module):
-    """A head with the original's names of its weights."""
+    """A head with the original's weight names."""
 
     def __init__(self, config: HeadConfig, num_inputs: int, num_bins: int) -> None:
         super().__init__()
@@ -186,8 +186,8 @@ class ValueHead(nn.Module):
 class RynnBatch(VlmBatch):
     """Conversations with G groups of value tokens and Q groups of relative value tokens.
 
-    values, relatives: int64 [G] and [Q], index of the first token of each group among all tokens of the batch: the
-        B * L of the conversations, then those of the packs
+    values, relatives: int64 [G] and [Q], the groups' first tokens as indices among all tokens in the batch: the
+        conversations' B * L, then those in the packs
     """
 
     values: Tensor = field(kw_only=True)
@@ -215,7 +215,7 @@ class RynnBatch(VlmBatch):
 
 @dataclass(frozen=True)
 class RynnOutput:
-    """Logits of the values, [heads, G, K], and of the relative values, [G, K], of a batch.
+    """A batch's logits: values, [heads, G, K], and relative values, [G, K].
 
     made: features from the vision tower, [merged tokens, levels, D]; None: all shots are cached
     """
@@ -240,7 +240,7 @@ class RynnNetwork(nn.Module):
         self.relative_value_head = ValueHead(*of_relative)
 
     def forward(self, batch: RynnBatch) -> RynnOutput:
-        """Return the logits of each group of a batch, which is on the network's device."""
+        """Return the logits for every group in a batch on the network's device."""
         hidden, made = qwen_states(self.model, batch, graphs=self.graphs)
         states = hidden.flatten(0, 1)
         values = _of_groups(states, batch.values, self.config.value_copies)
@@ -250,5 +250,5 @@ class RynnNetwork(nn.Module):
 
 
 def _of_groups(states: Tensor, firsts: Tensor, copies: int) -> Tensor:
-    """Return the states of groups side by side: [all tokens, D] -> [G, R * D]; ``firsts``: first token of each."""
+    """Return the groups' states side by side: [all tokens, D] -> [G, R * D]; ``firsts``: their first tokens."""
     return states[firsts[:, None] + torch.arange(copies, device=states.device)].flatten(1)

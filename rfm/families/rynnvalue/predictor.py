@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The predictor of RynnValue: the seconds that remain at each frame, and those since the frame before."""
+"""The RynnValue predictor: the seconds that remain at each frame, and those since the previous frame."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from rfm_client.contract.samples import Float32Array
 
 
 class RynnPredictor(QwenPredictor):
-    """A RynnValue on a device."""
+    """A RynnValue model on a device."""
 
     collator: RynnCollator
     has_progress = False
 
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: Any, execution: Execution) -> list[RowScores | RewardError]:
-        """Run one forward pass; return each row's scores."""
+        """Run one forward pass; return the rows' scores."""
         output = self._output(batch)
         remaining_s, entropies, relative_s, may_keep = self._read(output)
         if may_keep:
@@ -58,7 +58,7 @@ class RynnPredictor(QwenPredictor):
 
 
 def _scores(remaining_s: Float32Array, entropies: Float32Array, relative_s: Float32Array) -> FrameScores:
-    """Return the scores of frames. A first frame has no relative value: no time has passed."""
+    """Return frame scores. A first frame has no relative value: no time has passed."""
     unknown = no_success(remaining_s)
     missing = np.zeros(len(remaining_s) - len(relative_s), np.float32)
     return FrameScores(

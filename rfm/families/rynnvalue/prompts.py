@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The prompt, the frames and the rows of RynnValue: one conversation, in which value tokens follow each frame.
+"""The prompt, frames and rows for RynnValue: one conversation, in which value tokens follow each frame.
 
-L tokens. Source: ``rynn_value`` of ``alibaba-damo-academy/RynnValue``.
+L tokens. Source: ``rynn_value`` in ``alibaba-damo-academy/RynnValue``.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ BEHIND_FRAMES = (
 
 @dataclass(frozen=True, eq=False)
 class Conversation:
-    """The tokens about a number of frames.
+    """The tokens in a conversation about several frames.
 
     input_ids, position_ids: int64 [L] and [3, L]
-    groups: for each frame, its groups of value tokens (first, behind the last): the relative one, from the second
-        frame on, and the value
+    groups: by frame, its groups of value tokens (first, behind the last): the relative one, from the second frame on,
+        and the value
     """
 
     input_ids: Indices
@@ -57,7 +57,7 @@ class Conversation:
 
     @property
     def slots(self) -> Indices:
-        """The number of each token's group, int64 [L]; -1: an ordinary token."""
+        """Each token's group number, int64 [L]; -1: an ordinary token."""
         slots = np.full(len(self.input_ids), -1)
         for number, (first, behind) in enumerate(group for of_frame in self.groups for group in of_frame):
             slots[first:behind] = number
@@ -65,10 +65,10 @@ class Conversation:
 
 
 class RynnCollator(QwenCollator):
-    """The collator of RynnValue: a conversation about all frames, in dense mode one for each prefix.
+    """The collator for RynnValue: one conversation about all frames, or one per prefix in dense mode.
 
-    A row ends with the last value token: nothing behind it changes a value. With isolated attention, it has no value
-    tokens at all: nobody sees them, so the groups follow the conversation as leaves.
+    A row ends with the last value token: nothing behind it changes a value. With isolated attention, the row has no
+    value tokens at all: no other token sees them, so the groups follow the conversation as leaves.
     """
 
     config: RynnConfig  # not a VlmConfig, whose heads differ
@@ -89,13 +89,13 @@ class RynnCollator(QwenCollator):
             raise CheckpointError.at("chat template", f"one {IMAGE} and then {END_OF_TURN}", repr(text))
 
     def example(self) -> str:
-        """Return the prompt of an example task with two frames."""
+        """Return the prompt for an example task with two frames."""
         before, behind = self._around_frames("TASK")
         relative, value = RELATIVE_TOKEN * self.config.relative_copies, VALUE_TOKEN * self.config.value_copies
         return before + IMAGE + value + IMAGE + relative + value + behind
 
     def rows(self, sample: Sample) -> list[VlmRow]:
-        """Return the conversations of a progress sample. Raises InvalidSampleError."""
+        """Return the conversations for a progress sample. Raises InvalidSampleError."""
         check_type(sample, self.config)
         assert isinstance(sample, ProgressSample)  # by check_type
         (trajectory,) = sample.trajectories
@@ -130,18 +130,18 @@ class RynnCollator(QwenCollator):
         return Conversation(ids, self._position_ids(ids, (video,)), groups)
 
     def collate(self, rows: Sequence[VlmRow], length: int | None = None) -> RynnBatch:
-        """Return the batch of conversations. length: as in ``QwenCollator.collate``"""
+        """Return the conversations as a batch. length: as in ``QwenCollator.collate``."""
         return RynnBatch.of(super().collate(rows, length), self.config.relative_token, self.config.relative_copies)
 
     def num_groups(self, row: VlmRow) -> tuple[int, int]:
-        """Return the number of values and of relative values that are read of a row."""
+        """Return how many values and how many relative values are read from a row."""
         parts = [leaf.input_ids[slice(*leaf.reads)] for leaf in row.leaves]
         ids = np.concatenate([*parts, *(row.input_ids[slice(*span)] for span in row.spans[0])])
         values, relatives = ((ids == token).sum() for token in (self.config.value_token, self.config.relative_token))
         return int(values) // self.config.value_copies, int(relatives) // self.config.relative_copies
 
     def _rendered(self, task: str) -> tuple[str, str]:
-        """Return the text before the first frame, and behind the value tokens of the last."""
+        """Return the text before the first frame, and the text behind the last frame's value tokens."""
         before, _, behind = self._template(task).partition(IMAGE)
         return before, behind.rpartition(END_OF_TURN)[0]
 
@@ -156,7 +156,7 @@ class RynnCollator(QwenCollator):
 def _causal(
     conversation: Conversation, video: VlmVideo, read: list[list[tuple[int, int]]], picked: Indices | None
 ) -> VlmRow:
-    """Return the row of a conversation whose value tokens are ordinary tokens."""
+    """Return a conversation as a row, with ordinary tokens for the values."""
     spans = [(of_frame[0][0], of_frame[-1][1]) for of_frame in read]
     end = spans[-1][1]
     ids, at = conversation.input_ids[:end], conversation.position_ids[:, :end]
@@ -168,7 +168,7 @@ def _without_groups(
 ) -> tuple[Conversation, list[Leaf]]:
     """Return the conversation up to the last frame, without value tokens, and the groups that are read, as leaves.
 
-    a_frame: any frame of the video, for leaves that show none
+    a_frame: any frame in the video, for leaves that show none
     """
     is_kept = (conversation.slots < 0) & (np.arange(len(conversation.slots)) < read[-1][-1][1])
     ids, at = conversation.input_ids, conversation.position_ids
@@ -184,14 +184,14 @@ def _without_groups(
 
 
 def _bare(conversation: Conversation, video: VlmVideo, picked: Indices | None) -> VlmRow:
-    """Return the row of a conversation of which nothing is read."""
+    """Return a conversation as a row from which nothing is read."""
     end = len(conversation.input_ids)
     ids, at = conversation.input_ids, conversation.position_ids
     return VlmRow(ids, (video,), ([(end, end)],), None, False, picked=picked, position_ids=at)
 
 
 def _with_groups(row: VlmRow, groups: Sequence[Leaf]) -> VlmRow:
-    """Return the row, or tree of rows, with the groups behind each of its conversations."""
+    """Return the row, or tree of rows, with the groups behind each conversation."""
     packs: list[tuple[Leaf, ...]] = []
     for pack in row.packs:
         behind = [
@@ -200,7 +200,7 @@ def _with_groups(row: VlmRow, groups: Sequence[Leaf]) -> VlmRow:
             for group in groups
         ]
         packs.append((*pack, *behind))
-    for group in map(replace, groups):  # each leaf is an object of its own
+    for group in map(replace, groups):  # gives every leaf its own object
         num_tokens = group.num_tokens + sum(leaf.num_tokens for leaf in packs[-1]) if packs else 0
         if packs and fits(num_tokens, row.num_tokens):
             packs[-1] = (*packs[-1], group)

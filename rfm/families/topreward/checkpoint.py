@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""TOPReward of a Qwen3-VL: there is no checkpoint of its own, only a prompt and its settings."""
+"""TOPReward on a Qwen3-VL: there is no separate checkpoint, only a prompt and its settings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rfm_client.contract.description import Description
 
 @dataclass(frozen=True)
 class TopRewardCheckpoint(LanguageCheckpoint):
-    """A model of TOPReward in memory."""
+    """A TOPReward model in memory."""
 
     made_of = TopRewardConfig
     predictor_of = TopRewardPredictor

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The predictor of TOPReward: log-probabilities of the answer behind each prefix, and progress relative to them."""
+"""The TOPReward predictor: the answer's log-probability behind each prefix, and progress relative to these."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class TopRewardPredictor(QwenPredictor):
 
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
-        """Run one forward pass; return the log-probabilities of the answers of each row's prefixes, or its error."""
+        """Run one forward pass; return the answer's log-probability for every prefix in a row, or the row's error."""
         output = self._output(batch)
         prefixes = [ids for row in rows for ids in (*(leaf.input_ids for leaf in row.leaves), row.input_ids)]
         answers = torch.tensor([int(ids[-1]) for ids in prefixes]).to(output.logits.device)
@@ -38,7 +38,7 @@ class TopRewardPredictor(QwenPredictor):
         return [RowScores([_unjoined(of_row)]) for of_row in np.split(log_probs, ends[:-1])]
 
     def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
-        """Return the scores of an episode's frames: progress is 0 at the least likely prefix, 1 at the likeliest."""
+        """Return an episode's frame scores: progress is 0 at the least likely prefix, 1 at the likeliest."""
         num_frames = sample.trajectories[0].num_frames
         prefixes = self.collator.config.prefixes(num_frames)
         log_probs = FrameScores.joined([row.frames[0] for row in rows]).log_prob

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Settings, prompts and frames of TOPReward, as LeRobot and as Robometer's baseline have them.
+"""TOPReward's settings, prompts and frames, as in LeRobot and in Robometer's baseline.
 
-Sources: ``lerobot/rewards/topreward`` of LeRobot, July 2026; ``robometer/evals/baselines/topreward.py``.
+Sources: ``lerobot/rewards/topreward`` in LeRobot, July 2026; ``robometer/evals/baselines/topreward.py``.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ Variant: TypeAlias = Literal["lerobot", "robometer"]
 PROMPT_PREFIX = "The above video shows a robot manipulation trajectory that completes the following task: "
 PROMPT_SUFFIX = "{instruction} Decide whether the above statement is True or not. The answer is: True"
 ANSWER = "True"
-# Robometer's baseline: its processor takes each video for one of 24 frames a second, and samples 2 a second.
+# Robometer's baseline: its processor assumes 24 frames per second for every video, and samples 2 per second.
 ASSUMED_FPS, SAMPLED_FPS, LEAST_SAMPLED = 24, 2, 4
-SIDES_PX = (224, 336, 320)  # to which it resizes a frame in turn: by Pillow, qwen-vl-utils and the processor
+SIDES_PX = (224, 336, 320)  # successive frame sizes, after Pillow, qwen-vl-utils and the processor
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,12 @@ class TopRewardConfig(LanguageConfig):
     """The configuration of TOPReward.
 
     variant: whose code it follows
-    chat_template: the answer stands behind the chat template's generation prompt; else behind the question
+    chat_template: the answer stands behind the chat template's generation prompt; otherwise behind the question
     prompt_prefix, prompt_suffix: text behind the video; the suffix has ``{instruction}`` and ends with the answer
-    fps: frames a second, from which LeRobot's variant writes times; Robometer's ignores it
-    num_prefixes: most prefixes that are scored, evenly spaced, the frames between are interpolated; None: all
-    max_frames: most frames of an episode
-    least_px, most_px: of a video, over all its frames, in LeRobot's variant
+    fps: frames per second, from which LeRobot's variant writes times; Robometer's ignores it
+    num_prefixes: most prefixes to score, evenly spaced; frames between them are interpolated; None: all
+    max_frames: most frames per episode
+    least_px, most_px: per video, over all frames, in LeRobot's variant
     """
 
     variant: Variant
@@ -67,7 +67,7 @@ class TopRewardConfig(LanguageConfig):
     reward_model: ClassVar[str] = "topreward"
 
     def prefixes(self, num_frames: int) -> Indices:
-        """Return the number of frames of each prefix that is scored, int64."""
+        """Return the frame counts of the prefixes to score, int64."""
         if self.variant == "robometer":
             if num_frames <= FRAMES_PER_GROUP:
                 return np.array([num_frames])
@@ -77,7 +77,7 @@ class TopRewardConfig(LanguageConfig):
         return np.unique(np.linspace(1, num_frames, self.num_prefixes).round().astype(np.int64))
 
     def shown(self, length: int) -> tuple[Indices, list[float]]:
-        """Return the frames of a prefix that the model sees, int64, and the seconds of each pair's mean time."""
+        """Return the prefix frames that the model sees, int64, and each pair's mean time in seconds."""
         if self.variant == "lerobot":
             shown = np.arange(length)
             times_s = [frame / self.fps for frame in shown.tolist()]
@@ -92,7 +92,7 @@ class TopRewardConfig(LanguageConfig):
 
 @dataclass(frozen=True)
 class TopRewardImages(QwenImages):
-    """The preprocessing of videos."""
+    """The preprocessing of videos, in both variants."""
 
     config: TopRewardConfig = field(kw_only=True)
 
@@ -108,13 +108,13 @@ class TopRewardImages(QwenImages):
         return bounded_size(height, width, factor, bounds_px, num_frames, num_filled)
 
     def grid(self, groups: int, height: int, width: int) -> Grid:
-        """Return the grid of ``groups`` temporal patches of frames of this size in pixels."""
+        """Return the grid for ``groups`` temporal patches whose frames have this size in pixels."""
         if self.config.variant == "robometer":
             height = width = SIDES_PX[-1]
         return super().grid(groups, height, width)
 
     def patches(self, frames: Tensor, shots: Tensor | None, dtype: torch.dtype = torch.float32) -> Tensor:
-        """Cut frames into patches, as ``QwenImages`` does; Robometer's variant resizes them in float before."""
+        """Cut frames into patches, as ``QwenImages`` does; Robometer's variant first resizes them in float."""
         if self.config.variant == "robometer":
             planes = frames.movedim(-1, 1).float()
             planes = F.interpolate(planes, (SIDES_PX[-1], SIDES_PX[-1]), mode="bicubic", antialias=True)
@@ -123,13 +123,13 @@ class TopRewardImages(QwenImages):
 
 
 class TopRewardCollator(LanguageCollator):
-    """The collator of TOPReward: a conversation for each prefix of a trajectory."""
+    """The collator for TOPReward: one conversation per trajectory prefix."""
 
     images: TopRewardImages
     config: TopRewardConfig  # no heads, so no VlmConfig
 
     def rows(self, sample: Sample) -> list[VlmRow]:
-        """Return the conversations of a progress sample. Raises InvalidSampleError."""
+        """Return the conversations for a progress sample. Raises InvalidSampleError."""
         frame_steps = getattr(sample, "frame_steps", 0)
         if frame_steps:
             expected = "0 (TOPReward's progress is relative to the whole episode; for each step there is log_prob)"
@@ -140,7 +140,7 @@ class TopRewardCollator(LanguageCollator):
         return super().rows(sample)
 
     def prompts(self, video: VlmVideo, task: str) -> list[VlmRow]:
-        """Return a conversation for each prefix that is scored. Prefixes of equal size share the resized frames."""
+        """Return a conversation for every prefix to score. Prefixes with equal frame sizes share the resized frames."""
         text = self.text(task)
         of_prefixes = [self.config.shown(int(length)) for length in self.config.prefixes(len(video.frames))]
         sizes = [self.images.size(*video.size, len(shown)) for shown, _ in of_prefixes]
@@ -156,11 +156,11 @@ class TopRewardCollator(LanguageCollator):
         return [self.row(videos[size], text, shown, times_s) for (shown, times_s), size in prefixes]
 
     def example(self) -> str:
-        """Return the prompt of an example task, with VIDEO in the place of the video."""
+        """Return the prompt for an example task, with VIDEO as placeholder."""
         return self.text("TASK")
 
     def text(self, task: str) -> str:
-        """Return the prompt, with VIDEO in the place of the video, and the answer at its end."""
+        """Return the prompt, with VIDEO as placeholder, and the answer at its end."""
         statement = self.config.prompt_suffix.format(instruction=task)
         if not self.config.chat_template:
             question = self.template(self.config.prompt_prefix, add_generation_prompt=False)
@@ -176,7 +176,7 @@ class TopRewardCollator(LanguageCollator):
         return replace(row, query=row.num_tokens - 2)
 
     def grid(self, video: VlmVideo) -> Grid:
-        """Return the grid of the longest conversation about a video."""
+        """Return the grid for the longest conversation about a video."""
         size = self.images.size(*video.size, video.num_shown)
         return self.images.grid(math.ceil(video.num_shown / FRAMES_PER_GROUP), *size)
 
