@@ -147,8 +147,9 @@ class Rollout:
         return f"served as before: {'; '.join(f'{model}: {_words(versions)}' for model, versions in served.items())}"
 
     def _put_back(self, config: pb.ModelConfig, versions: Sequence[int]) -> str | None:
-        """Restore a model's file and served versions. Return why it failed: no server, or other models come
-        first; None: restored.
+        """Restore a model's file and served versions. Return why this failed, or None.
+
+        A failure means that there is no server, or that other models come first.
         """
         try:
             self._write(serving_versions(config, versions) if versions else config)

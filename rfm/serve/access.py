@@ -162,12 +162,12 @@ class Endpoints:
 
     @property
     def http_url(self) -> str:
-        """HTTP URL of the server, for RewardClient."""
+        """Server URL for HTTP, for RewardClient."""
         return f"http://{in_url(self.http_host)}:{self.http_port}"
 
     @property
     def grpc_url(self) -> str:
-        """gRPC URL of the server, for RewardClient."""
+        """Server URL for gRPC, for RewardClient."""
         return f"{'grpc' if self.grpc_tls is None else 'grpcs'}://{in_url(self.host)}:{self.grpc_port}"
 
     @property

@@ -40,8 +40,9 @@ Scored: TypeAlias = list[tuple[Sequence[Request[Question]], Execution]]  # reque
 
 
 class BatchModel(Generic[Question, Answer]):
-    """Adapter between Triton and a function from questions to answers. A question is a sample or an
-    encoder's sample; a request holds one or more.
+    """Adapter between Triton and a function from questions to answers.
+
+    A question is a sample or an encoder's sample; a request holds one or more.
 
     A subclass reads a request's tensors (``decode``), checks and prepares each question (``prepare``), answers
     questions (``answer``), and writes a request's answers (``encode``).

@@ -36,7 +36,7 @@ AS_FILES = "send arrays as .npy files, to /evaluate_batch_npy"
 LARGER = "send less in one request, or start the gateway with --max-body-mib (rfm serve: --gateway-max-body-mib)"
 
 _format: Any = np.lib.format  # numpy declares no types for it
-_BROKEN_NPY = (ValueError, TypeError, LookupError, SyntaxError, TokenError, MemoryError, RecursionError)  # malformed
+_BROKEN_NPY = (ValueError, TypeError, LookupError, SyntaxError, TokenError, MemoryError, RecursionError)  # numpy errors
 _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
 _SAMPLE_FIELD = re.compile(r"sample_(0|[1-9][0-9]{0,5})")
 _CHARSETS = ("utf-8", "utf8", "us-ascii")

@@ -144,7 +144,7 @@ class GatewayConfig(Settings):
 
     @property
     def tls(self) -> dict[str, Any]:
-        """uvicorn's arguments for TLS. Raises ConfigError for unusable files."""
+        """TLS arguments for uvicorn. Raises ConfigError for unusable files."""
         if self.certificate is None or self.key is None:
             return {}
         check_certificate(self.certificate, self.key, "certificate")

@@ -126,7 +126,7 @@ class ShownHdf5(ShownDataset):
 
     @property
     def path(self) -> Path:
-        """The dataset's file."""
+        """The single file that holds the dataset."""
         return self.dataset.file
 
     def check(self) -> None:

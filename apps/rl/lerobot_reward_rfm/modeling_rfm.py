@@ -105,7 +105,7 @@ class RfmRewardModel(PreTrainedRewardModel):
         return self._tensor(batch, -scores if output == "remaining_s" else scores)
 
     def predict_progress(self, batch: Mapping[str, Any]) -> RfmPrediction:
-        """Return scores for all frames. Later frames are hidden from a frame, so the last matches ``compute_reward``.
+        """Return scores for all frames. No score uses later frames, so the last equals ``compute_reward``'s.
 
         The server scores B times T samples. Raises RewardError.
         """
