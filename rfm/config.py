@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The settings of an export and a server: the sections ``export`` and ``serve`` of one YAML file.
+"""The settings of an export and a server: the sections ``export`` and ``serve`` in one YAML file.
 
 ``rfm_commands.config`` reads this file.
 """
@@ -27,10 +27,10 @@ __all__ = ["CheckpointConfig", "ExportConfig", "ServeConfig", "address_of"]
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_TOKEN_BUDGET = 16_384
 DEFAULT_SAMPLE_TOKENS = 131_072
-DEFAULT_FEATURE_CACHE_MB = 256  # 80,000 embeddings of 768 numbers, or 170 frames of 256x256 of a 4B Qwen3-VL
+DEFAULT_FEATURE_CACHE_MB = 256  # 80,000 embeddings with 768 numbers, or 170 frames at 256x256 for a 4B Qwen3-VL
 MAX_OF_A_MACHINE = 4096  # GPUs, instances, threads
 MAX_INT32 = 2**31 - 1
-MAX_NAME = 100  # characters; the name of a model becomes that of a folder
+MAX_NAME = 100  # characters; a model's name becomes a folder name
 Dtype: TypeAlias = Literal["float32", "bfloat16", "float16"]
 VideoPrompt: TypeAlias = Literal["bare", "wrapped"]
 Weights: TypeAlias = Literal["int8", "nf4"]
@@ -43,7 +43,7 @@ _OR_MOVED = ", or 20 more while another setting names that port."
 
 @dataclass(frozen=True)
 class CheckpointConfig(Settings):
-    """A checkpoint, how it is asked, and its numbers."""
+    """A checkpoint, how it is asked, and its number formats."""
 
     TITLE: ClassVar[str] = "Checkpoint"
 
@@ -144,9 +144,9 @@ class ExportConfig(CheckpointConfig):
 
 @dataclass(frozen=True)
 class ServeConfig(Settings):
-    """The settings of ``rfm serve`` itself. To change them, start it again.
+    """The settings of ``rfm serve`` itself. To change them, restart it.
 
-    ``host`` may be a URL; only its address is kept. ``Endpoints.of`` chooses Triton's ports that are None.
+    ``host`` may be a URL; only its address is kept. ``Endpoints.of`` chooses Triton's ports where they are None.
     """
 
     TITLE: ClassVar[str] = "Triton and its watch"
@@ -186,7 +186,7 @@ class ServeConfig(Settings):
 
 
 def address_of(host: str) -> str:
-    """Return the IP address in a host's URL or name. Raises ConfigError."""
+    """Return the IP address that a host's URL or name contains. Raises ConfigError."""
     address = (host.partition("://")[2] or host).rstrip("/")
     if address == "localhost":
         return DEFAULT_HOST
@@ -196,6 +196,6 @@ def address_of(host: str) -> str:
         if "%" in address:  # an IPv6 zone, which Triton's HTTP server does not support
             raise ValueError
         return str(ipaddress.ip_address(address))
-    except ValueError:  # Triton would take a name as 255.255.255.255
+    except ValueError:  # Triton would read a name as 255.255.255.255
         expected = "an IP address without a port, such as 127.0.0.1, ::1, 0.0.0.0 or ::"
         raise ConfigError.at("host", expected, f"{address!r:.200}") from None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Files of a checkpoint: read, in bounded memory and time, since they are not trusted; fetch; digest."""
+"""Checkpoint files: fetch them, digest them, and read them in bounded memory and time, because they are untrusted."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ ADAPTER_WEIGHTS = "adapter_model.safetensors"
 RUN_CONFIG = "config.yaml"
 RUN_CONFIGS = (RUN_CONFIG, "config.yml", ".hydra/config.yaml")  # the first that exists is read
 PREPROCESSOR_CONFIG = "preprocessor_config.json"  # image preprocessing, beside a model's weights
-PIL_BICUBIC = 3  # a value of `resample` in it
+PIL_BICUBIC = 3  # a value of `resample` in PREPROCESSOR_CONFIG
 MAX_UINT8 = 255
 MAX_JSON_BYTES = 2**24
-MAX_HEADER_BYTES = 2**24  # of a safetensors file; a tensor takes about 100 bytes
-_LENGTH = struct.Struct("<Q")  # of a safetensors file's header
-_START_BYTES = 64  # enough to tell what a file is instead
+MAX_HEADER_BYTES = 2**24  # for a safetensors file; a tensor takes about 100 bytes
+_LENGTH = struct.Struct("<Q")  # length field before a safetensors header
+_START_BYTES = 64  # enough to recognise another kind of file
 _DTYPES = ("F64", "F32", "F16", "BF16", "I64", "I32", "I16", "I8", "U8", "BOOL")
 _KINDS = {
     stat.S_IFDIR: "a folder",
@@ -49,7 +49,7 @@ _KINDS = {
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
 }
-# Exceptions of libraries for unexpected content.
+# Exceptions that libraries raise for unexpected content.
 _MISFITS = (
     ArithmeticError,
     AssertionError,
@@ -70,7 +70,7 @@ class CheckpointError(LocatedError):
 
 
 def misfits(*others: type[Exception]) -> tuple[type[Exception], ...]:
-    """Return ``others`` and the exceptions of libraries for unexpected content, with the Hub's from transformers 5."""
+    """Return ``others`` and the exceptions that libraries raise for unexpected content (Hub: from transformers 5)."""
     from huggingface_hub import errors
 
     return (*others, *_MISFITS, getattr(errors, "StrictDataclassError", ValueError))
@@ -89,12 +89,12 @@ def shown(value: object) -> str:
     """Return the value as a short line for an error message."""
     try:
         return _short.repr(value)
-    except ValueError:  # Python does not print a number with so many digits
+    except ValueError:  # Python refuses to print a number with this many digits
         return f"a huge {type(value).__name__}"
 
 
 def cut(text: str, most: int = 1000) -> str:
-    """Return the text, or its beginning, on one line."""
+    """Return the text on one line, cut to ``most`` characters."""
     line = " ".join(text[:most].split())
     return line if len(text) <= most else f"{line}..."
 
@@ -137,12 +137,12 @@ def read_json(file: Path) -> dict[str, Any]:
 
 
 def network_config(folder: Path) -> dict[str, Any]:
-    """Return config.json of a checkpoint's folder; empty if there is none. Raises CheckpointError."""
+    """Return config.json from a checkpoint folder; empty if there is none. Raises CheckpointError."""
     return read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
 
 
 def read_run_config(file: Path) -> dict[str, Any]:
-    """Return config.yaml as plain mappings, lists and scalars, also where its tags name Python objects.
+    """Return config.yaml as plain mappings, lists and scalars, even where tags name Python objects.
 
     Raises CheckpointError.
     """
@@ -157,7 +157,7 @@ def read_run_config(file: Path) -> dict[str, Any]:
 
 
 def read_tensors(file: Path) -> dict[str, Tensor]:
-    """Return all tensors of a safetensors file. Raises CheckpointError."""
+    """Return all tensors in a safetensors file. Raises CheckpointError."""
     from safetensors.torch import load_file  # imported here: PyTorch takes seconds, and few commands need it
 
     _require(file)
@@ -180,7 +180,7 @@ def tensor_names(file: Path) -> list[str]:
 
 
 def check_one_form(folder: Path) -> None:
-    """Raise CheckpointError for weights both in one file and in shards, since no file tells which are newer."""
+    """Raise CheckpointError for weights both in one file and in shards, because no file tells which are newer."""
     shards = [path.name for path in (folder / WEIGHTS_INDEX, *sorted(folder.glob(SHARDS))) if is_there(path)]
     if shards and is_there(folder / WEIGHTS):
         expected = f"{WEIGHTS} or shards"
@@ -240,15 +240,15 @@ _PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
 
 PROVENANCE = "provenance.json"  # beside an exported checkpoint's config.json; nothing reads it
 MODEL_CARD = "README.md"
-DIGEST_DIGITS = 16  # of 64; enough to identify a checkpoint and to detect damage
-# Suffixes of the files that decide scores, besides weights: configuration, tokenizer, image processor. The Hub is asked
-# for them, too.
+DIGEST_DIGITS = 16  # out of 64; enough to identify a checkpoint and to detect damage
+# Suffixes of files that decide scores besides weights: configuration, tokenizer, image processor. These are also
+# fetched from the Hub.
 SETTINGS_SUFFIXES = (".json", ".jinja", ".model", ".txt", ".yaml", ".yml")
 _CHUNK_BYTES = 2**22
 
 
 def weights_digest(folders: Iterable[Path]) -> str:
-    """Return the first DIGEST_DIGITS of the SHA-256 of all safetensors files in the folders. Raises OSError."""
+    """Return the first DIGEST_DIGITS of the SHA-256 over all safetensors files in the folders. Raises OSError."""
     digest = hashlib.sha256()
     for file in (file for folder in folders for file in sorted(folder.rglob("*.safetensors"))):
         with file.open("rb") as content:
@@ -258,10 +258,10 @@ def weights_digest(folders: Iterable[Path]) -> str:
 
 
 def settings_digest(folders: Iterable[Path], told: Mapping[str, Any]) -> str:
-    """Return the first DIGEST_DIGITS of the SHA-256 of all settings that decide scores. Raises OSError.
+    """Return the first DIGEST_DIGITS of the SHA-256 over all settings that decide scores. Raises OSError.
 
-    folders: of these, all files of SETTINGS_SUFFIXES count, with their paths, except PROVENANCE
-    told: settings that no file holds, as values of JSON
+    folders: all files in them with SETTINGS_SUFFIXES count, with their paths, except PROVENANCE
+    told: settings that no file holds, as JSON values
     """
     digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
     for folder in folders:
@@ -280,10 +280,10 @@ HUB_FILES = [HUB_WEIGHTS, *(f"*{suffix}" for suffix in SETTINGS_SUFFIXES), MODEL
 
 
 def local_copy(source: str | Path, *, with_weights: bool = False) -> Path:
-    """Return the folder of a base model or encoder: the folder itself, or main of a Hub id, fetched if necessary.
+    """Return the folder of a base model or encoder: ``source`` itself, or a Hub id's main branch, fetched if necessary.
 
-    transformers asks an unreachable Hub for each file again and again.
-    with_weights: False: its settings alone
+    By itself, transformers would ask an unreachable Hub repeatedly for each file.
+    with_weights: False: fetch only the settings
     Raises OSError.
     """
     path = Path(source)

@@ -13,12 +13,12 @@ MAX_YAML_BYTES = 2**18  # a training run's config.yaml has a few thousand
 MAX_YAML_VALUES = 100_000  # with all aliases and merge keys expanded
 MAX_DIGITS = 100
 
-# PyYAML's own errors and those that it raises for `!!timestamp x`, `!!bool x`, `!!int ""`, 5000 digits, 1000 brackets.
+# PyYAML's errors, and those that it raises for `!!timestamp x`, `!!bool x`, `!!int ""`, 5000 digits, 1000 brackets.
 _MISREAD = (yaml.YAMLError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
 
 def read_yaml(file: Path, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
-    """Return the file's single document. Raises OSError, and ValueError for invalid YAML or exceeded limits."""
+    """Return the file's only document. Raises OSError, and ValueError for invalid YAML or exceeded limits."""
     with file.open("rb") as content:
         text = content.read(MAX_YAML_BYTES + 1)
     if len(text) > MAX_YAML_BYTES:
@@ -44,7 +44,7 @@ def read_yaml(file: Path, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> An
 def _num_values(node: yaml.Node, known: dict[int, int | None]) -> int:
     """Count the values in a node, with its aliases expanded.
 
-    Raises ValueError for a node inside itself and for a duplicate key.
+    Raises ValueError for a node that contains itself and for a duplicate key.
     """
     if id(node) in known:
         count = known[id(node)]

@@ -11,7 +11,7 @@ from rfm_client.contract.samples import blank_trajectory
 
 
 def probe_request(config: Mapping[str, Any]) -> wire.Tensors:
-    """Return the inputs of one blank sample, for a model with this configuration."""
+    """Return the inputs for one blank sample, for a model with this configuration."""
     dims = {tensor["name"]: [int(dim) for dim in tensor["dims"]] for tensor in config["input"]}
     widths = None
     if wire.VIDEO_EMBEDDINGS in dims:

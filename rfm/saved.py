@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Checkpoints as ``rfm export`` writes them: all that serving reads.
 
-A checkpoint on a Qwen backbone is a folder with one file of weights, transformers' ``config.json`` with this project's
-settings under the key SETTINGS, and the files of its processor.
+A checkpoint on a Qwen backbone is a folder with one weights file, transformers' ``config.json`` with this project's
+settings under the key SETTINGS, and the processor's files.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 from rfm.files import NETWORK_CONFIG, WEIGHTS, CheckpointError, network_config, read_json, read_tensors, shown
 
 SETTINGS = "rfm"  # key in config.json
-REWARD_MODEL = "reward_model"  # key in SETTINGS, of a model that is asked in words
+REWARD_MODEL = "reward_model"  # key in SETTINGS for a model that is asked in words
 PROCESSOR_FOLDER = "processor"
 
 
@@ -29,7 +29,7 @@ class Saved:
 
     backbone: transformers' configuration
     settings: this project's fields
-    processor: folder of tokenizer and preprocessing
+    processor: folder with tokenizer and preprocessing
     """
 
     folder: Path
@@ -39,7 +39,7 @@ class Saved:
 
     @property
     def processor(self) -> Path:
-        """The folder of tokenizer and preprocessing."""
+        """The folder with tokenizer and preprocessing."""
         return self.folder / PROCESSOR_FOLDER
 
     @classmethod

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Weights in memory: do they fit a network, and are they weights?"""
+"""Check weights in memory: they must fit the network, and must be real weights."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-# A rounded weight has more tensors, whose names end so instead of in ``.weight``. A byte of NF4 holds two values.
+# A rounded weight has extra tensors with these endings in place of ``.weight``. A byte of NF4 holds two values.
 SCALE, DECODED, VALUES_OF_BYTE = ".scale", ".decoded", 2
 _MAY_BE_ZERO = re.compile(r"(progress|preference|success|similarity)_head\.|.*\.lora_[AB]\.")  # before training
 
 
 def num_values(weights: Mapping[str, Tensor]) -> dict[str, int]:
-    """Return the number of values of each weight. A byte of NF4 holds two; scales do not count."""
+    """Return how many values each weight has. A byte of NF4 holds two; scales do not count."""
     import torch  # imported here: it takes seconds
 
     counted = {name: tensor for name, tensor in weights.items() if not name.endswith((SCALE, DECODED))}
@@ -27,7 +27,7 @@ def num_values(weights: Mapping[str, Tensor]) -> dict[str, int]:
 
 
 def check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> None:
-    """Raise CheckpointError unless names, shapes and kinds of numbers (floating-point or not) agree."""
+    """Raise CheckpointError unless names, shapes and number kinds (floating-point or not) agree."""
     check_names(expected.keys(), got.keys())
     for name, tensor in got.items():
         if tensor.shape != expected[name].shape:
@@ -37,14 +37,14 @@ def check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> N
 
 
 def check_values(weights: Mapping[str, Tensor]) -> None:
-    """Raise CheckpointError for a weight that is not finite, or a matrix of zeros outside the reward heads.
+    """Raise CheckpointError for a weight that is not finite, or an all-zero matrix outside the reward heads.
 
-    Scores may still be finite, such as a success of 1. Zeros are what a file holds whose download was not finished.
+    Such weights may still give finite scores, such as a success of 1. An unfinished download leaves zeros.
     """
     for name, tensor in weights.items():
         if not (tensor.is_floating_point() and tensor.numel()):
             continue
-        extremes = tensor.aminmax()  # 50 times as fast as isfinite of each value
+        extremes = tensor.aminmax()  # 50 times as fast as isfinite on each value
         if not all(extreme.isfinite() for extreme in extremes):
             at = (~tensor.isfinite()).nonzero()[0].tolist()
             raise CheckpointError.at(name, "finite weights", f"{tensor[tuple(at)].item()} at {at}")
@@ -54,7 +54,7 @@ def check_values(weights: Mapping[str, Tensor]) -> None:
 
 
 def check_names(expected: Iterable[str], got: Iterable[str]) -> None:
-    """Raise CheckpointError unless the names of weights agree."""
+    """Raise CheckpointError unless the weight names agree."""
     missing, unexpected = sorted(set(expected) - set(got)), sorted(set(got) - set(expected))
     if missing or unexpected:
         named = [listed(names) if names else "none" for names in (missing, unexpected)]

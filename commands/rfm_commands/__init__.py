@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Commands of ``rfm``: they join packages that do not import each other."""
+"""The ``rfm`` commands. They join packages that do not import each other."""

@@ -53,7 +53,7 @@ app = typer.Typer(
     epilog="rfm runs on the server. On every other machine use rfm-client, which scores videos: rfm-client --help",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # Rich's tables cut off option names in a terminal of 80 columns
+    rich_markup_mode=None,  # Rich's tables cut off option names in a terminal with 80 columns
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": MOST_COLUMNS},
 )
 
@@ -129,7 +129,7 @@ def export(
 
 
 class ServeCommand(RfmCommand):
-    """``rfm serve``: an error about an unknown option says where options of tritonserver stand."""
+    """``rfm serve``: an error about an unknown option says where tritonserver's options belong."""
 
     unknown_option = "put options of tritonserver after --, as in rfm serve FOLDER -- {option}=VALUE"
 
@@ -224,7 +224,7 @@ app.add_typer(models_app, name="models")
 
 
 def _folder_and_arguments(words: Sequence[str], repository: Path | None) -> tuple[Path, Sequence[str]]:
-    """The repository, and the arguments of tritonserver: typer passes words after ``--`` as words, too."""
+    """Return the repository and tritonserver's arguments: typer passes words after ``--`` as words, too."""
     folder = words[0] if words and not words[0].startswith("-") else None
     if (folder is None) == (repository is None):
         raise typer.BadParameter(f"give FOLDER or --repository{', not both' * (folder is not None)}")
@@ -243,7 +243,7 @@ def _run(supervisor: Supervisor, log: Path | None) -> None:
             say(f"the lines of Triton and the models are in {log}")
         if not isinstance(error, CrashLoopError):
             raise
-        logger.error("%s", error)  # as the lines about the faults before it
+        logger.error("%s", error)  # in the same form as the faults logged before
         raise typer.Exit(1) from None
 
 
@@ -254,7 +254,7 @@ def _gateway_process(gateway: GatewayConfig, config: Config) -> GatewayProcess:
 
 
 def _beside(server: TritonServer, config: Config, given: Given[GatewayBeside]) -> GatewayConfig:
-    """The gateway's configuration, completed from the server's and checked: the gateway could start now."""
+    """Return the gateway's configuration, completed from the server's and checked: the gateway could start now."""
     gateway, endpoints = config.gateway, server.endpoints
     behind = replace(endpoints, host=from_here(endpoints.host))
     filled = replace(
@@ -277,7 +277,7 @@ def _beside(server: TritonServer, config: Config, given: Given[GatewayBeside]) -
 
 
 def _config(file: Path | None, **options: Given[Any]) -> Config:
-    """The file's configuration with the given options of each section."""
+    """Return the file's configuration with each section's given options."""
     return (Config() if file is None else Config.from_yaml(file)).with_options(**options)
 
 

@@ -22,14 +22,14 @@ TritonPath = Annotated[
 
 
 class RfmCommand(command.Command):
-    """A command of ``rfm``: an expected error takes one line, and ends it with 1."""
+    """Command class for ``rfm``: reports an expected error on one line and exits with 1."""
 
     program = "rfm"
     has_codes = False
 
 
 class RfmCommands(command.Commands):
-    """The commands of ``rfm``, which name ``rfm-client`` for the commands that only it has."""
+    """Command group for ``rfm``, which refers to ``rfm-client`` for commands that exist only there."""
 
     other_program = "rfm-client"
     others = ("score", "compare", "status", "wait", "sample", "bench-input", "evaluate")
@@ -41,5 +41,5 @@ def say(line: str) -> None:
 
 
 def fail(message: str) -> NoReturn:
-    """Write the message to standard error, and end the command with 1."""
+    """Write the message to standard error and exit with 1."""
     command.fail(message, RfmCommand.program)

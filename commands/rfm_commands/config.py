@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The YAML file of ``rfm``: sections export, serve and gateway, by the time at which keys take effect."""
+"""The YAML file for ``rfm``: sections export, serve and gateway, by the time at which keys take effect."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ SECTIONS: dict[str, type[Settings]] = {"export": ExportConfig, "serve": ServeCon
 
 @dataclass(frozen=True)
 class GatewayBeside(GatewayConfig):
-    """Settings of a gateway that ``rfm serve`` runs."""
+    """Settings for a gateway that ``rfm serve`` runs."""
 
     PREFIX: ClassVar[str] = "gateway-"
 
 
-FASTAPI_KEYS = {  # keys of the FastAPI server's file, and their settings here
+FASTAPI_KEYS = {  # the FastAPI server's keys, and the settings that they become here
     "model_path": "export.checkpoint",
     "num_gpus": "export.num_gpus",
     "batch_size": "export.batch_size",
@@ -41,7 +41,7 @@ _PORT_REMEDY = "leave Triton's out, and rfm serve chooses it"
 
 @dataclass(frozen=True)
 class Config:
-    """Settings of the file, and of the options that win over it. Raises ConfigError for a port used twice.
+    """Settings from the file, overridden by options. Raises ConfigError for a port used twice.
 
     gateway.port: None: no gateway
     """
@@ -93,7 +93,7 @@ class Config:
 
 
 def named_as_typed(section: str, options: Collection[str], name: str) -> str:
-    """Return the option of a setting that is one of ``options``, for another the key in the file."""
+    """Return the option for a setting in ``options``; for other settings the key in the file."""
     return _kind(section).settings()[name].option if name in options else f"{section}.{name}"
 
 
@@ -102,13 +102,13 @@ def _kind(section: str) -> type[Settings]:
 
 
 def _with_option(setting: str) -> str:
-    """A setting's key in the file, and its option of ``rfm serve``."""
+    """Return a setting's key in the file, and its ``rfm serve`` option."""
     section, _, key = setting.partition(".")
     return f"{setting} ({_kind(section).settings()[key].option})"
 
 
 def _entries(content: Any) -> Iterator[tuple[str, str, Any]]:
-    """Each key as the file writes it, its setting (``section.key``), and its value. Raises ConfigError."""
+    """Yield each key as the file writes it, the setting (``section.key``), and the value. Raises ConfigError."""
     for key, value in _items(content, ""):
         if key in FASTAPI_KEYS:
             yield key, FASTAPI_KEYS[key], _address(value) if key == "server_url" else value
@@ -122,7 +122,7 @@ def _entries(content: Any) -> Iterator[tuple[str, str, Any]]:
 
 
 def _address(url: Any) -> Any:
-    """The address in the FastAPI server's ``server_url``. Raises ConfigError."""
+    """Return the address in the FastAPI server's ``server_url``. Raises ConfigError."""
     try:
         return address_of(url) if isinstance(url, str) else url
     except ConfigError as error:
@@ -130,7 +130,7 @@ def _address(url: Any) -> Any:
 
 
 def _made(section: str, values: Mapping[str, Any], written: Mapping[str, str]) -> Any:
-    """A section with these values. Raises ConfigError, which names the key as the file does."""
+    """Return a section with these values. Raises ConfigError, which names the key as the file does."""
     kind = SECTIONS[section]
     known = kind.settings()
     try:
@@ -140,7 +140,7 @@ def _made(section: str, values: Mapping[str, Any], written: Mapping[str, str]) -
 
 
 def _items(content: Any, where: str) -> Iterable[tuple[Any, Any]]:
-    """Keys and values of a mapping; null is empty."""
+    """Return a mapping's keys and values; null is empty."""
     if content is None:
         return ()
     if not isinstance(content, dict):
@@ -149,7 +149,7 @@ def _items(content: Any, where: str) -> Iterable[tuple[Any, Any]]:
 
 
 def _unknown(name: str, known: Iterable[str]) -> ConfigError:
-    """The error of an unknown key, with the most similar key of any section."""
+    """Return the error for an unknown key, with the most similar key from any section."""
     names = [*FASTAPI_KEYS, *(f"{section}.{key}" for section, kind in SECTIONS.items() for key in kind.settings())]
     keys = [each.rpartition(".")[2] for each in names]
     close = get_close_matches(name.rpartition(".")[2], keys, 1, cutoff=0.75)

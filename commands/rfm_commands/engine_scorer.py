@@ -38,7 +38,7 @@ class EngineScorer:
     def __init__(self, source: str, *, device: str = "cpu", dtype: torch.dtype | None = None, **options: Any) -> None:
         """Load a checkpoint folder or Hugging Face id. Raises CheckpointError, or ExportError for a missing device.
 
-        dtype: of the network; None: float32 on the CPU, else the checkpoint's own
+        dtype: the network's type; None: float32 on the CPU, else the checkpoint's own
         options: as in ``rfm.published.read``
         """
         on = device_named(device)
@@ -56,11 +56,11 @@ class EngineScorer:
         self._lock = threading.Lock()
 
     def checkpoint(self) -> CheckpointFacts:
-        """Return the facts of the checkpoint."""
+        """Return facts about the checkpoint."""
         return self._facts
 
     def encode(self, frames: UInt8Array, task: str) -> Trajectory:
-        """Return embeddings of frames, uint8 [T, H, W, 3], and task. Raises RewardError."""
+        """Return embeddings for the task and frames, uint8 [T, H, W, 3]. Raises RewardError."""
         with self._lock:
             encoders = self._engine.encoders
             assert encoders is not None  # callers encode only if the facts say ``encodes``
@@ -69,7 +69,7 @@ class EngineScorer:
         return cast(EncoderSample, _result(outcome)).trajectories[0]
 
     def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
-        """Return the result of each sample. Raises RewardError for the first failure."""
+        """Return each sample's result. Raises RewardError for the first failure."""
         with self._lock:
             outcomes = self._engine.evaluate(samples)
         return [cast(ProgressResult, _result(outcome)) for outcome in outcomes]
@@ -106,7 +106,7 @@ def _facts(
 def _settings_digest(
     checkpoint: Checkpoint, encoders: FrameEncoders | None, folders: Sequence[Path], told: Mapping[str, Any]
 ) -> str:
-    """Digest of all that decides the scores besides the folders' weights, with the weights of the Hub's encoders."""
+    """Digest everything that decides scores except the folders' weights, including encoder weights from the Hub."""
     told = {**told, "network": config_fields(checkpoint.config)}
     if encoders is None:
         return settings_digest(folders, told)
@@ -121,14 +121,14 @@ def _settings_digest(
 
 
 def _named(value: Any) -> Any:
-    """The option, but None for a local folder, whose files count instead."""
+    """Return the option, but None for a local folder, whose files count instead."""
     return None if isinstance(value, str) and Path(value).is_dir() else value
 
 
 def _folders(source: str, options: dict[str, Any]) -> list[Path]:
-    """The local folders whose weights decide the scores, the checkpoint's first."""
+    """Return the local folders whose weights decide the scores, the checkpoint's first."""
     named = [options.get(name) for name in ("image_encoder", "text_encoder", "base_model")]
-    found = published.find(source, lambda line: None)  # ``published.read`` has told the line
+    found = published.find(source, lambda line: None)  # ``published.read`` has already reported the line
     return [found, *(Path(folder) for folder in named if folder and Path(folder).is_dir())]
 
 

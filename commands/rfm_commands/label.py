@@ -17,7 +17,7 @@ from rfm_commands.command import say
 from rfm_labels import LabelOptions, RayOptions, Scorer
 from rfm_labels.commands import DatasetArgument, EpisodeTexts, LabelCommand, RunOptions
 
-_ALWAYS_TOLD = ("image_encoder", "text_encoder", "base_model", "reward_model")  # to the recipe, also where not given
+_ALWAYS_TOLD = ("image_encoder", "text_encoder", "base_model", "reward_model")  # in the recipe even if not given
 
 
 @dataclass(frozen=True)

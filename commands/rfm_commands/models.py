@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """``rfm models``: list and change the models and versions that a running server serves.
 
-NAME is that of ``rfm export --name``, and means all models of the checkpoint. The commands use gRPC, because a load
-over HTTP makes the server's other callers wait.
+NAME is the name given to ``rfm export --name``, and means all models for the checkpoint. The commands use gRPC, because
+a load over HTTP makes the server's other callers wait.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Change the served version of a checkpoint's models on a running server, without losing a request.
+"""Change which version of a checkpoint's models a running server serves, without losing a request.
 
 Files and server change in step, so that a restart serves the same versions. A checkpoint with encoders has three
-models: encoder and scorer (the parts), and an ensemble, whose configuration names the version of each part. The steps:
+models: encoder and scorer (the parts), and an ensemble, whose configuration names each part's version. The steps:
 
 1. Each part serves the new version beside the old. Triton warms up the new version first; if that fails, the new
    version gets no request.
-2. The new version of each part answers a probe that names it.
-3. The ensemble changes to the new version. Triton finishes the requests of the old version.
-4. Each part serves the new version alone. Triton again finishes the requests of the old version. Every model then
+2. Each part's new version answers a probe that names it.
+3. The ensemble changes to the new version. Triton finishes the old version's requests.
+4. Each part serves the new version alone. Triton again finishes the old version's requests. Every model then
    answers a last probe.
 
 If a step fails, the server loads the old versions with their own configurations again. Their files are
@@ -55,7 +55,7 @@ Configs = Mapping[str, pb.ModelConfig]
 
 
 class RolloutError(ExportError):
-    """A version that cannot be served, and the reason."""
+    """A version that cannot be served, and why."""
 
 
 def models_of(repository: Path, name: str) -> list[str]:
@@ -89,7 +89,7 @@ def previous_version(repository: Path, name: str, server: RepositoryApi) -> int:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A change of NAME's version on a server. report: takes a line for each step"""
+    """A change of NAME's version on a server. report: receives a line for each step"""
 
     repository: Path
     name: str
@@ -106,7 +106,7 @@ class Rollout:
         served = {model: self.server.ready_versions(model) for model in models}
         try:
             new = self._configs(models, dict.fromkeys(models, version))
-            # A model that is not served keeps the configuration in the repository.
+            # A model that is not served keeps its configuration in the repository.
             old = {model: read_config(self.repository, model) for model in models if not served[model]}
             old |= self._configs(models, {model: max(served[model]) for model in models if served[model]})
         except (OSError, ParseError) as error:
@@ -147,8 +147,9 @@ class Rollout:
         return f"served as before: {'; '.join(f'{model}: {_words(versions)}' for model, versions in served.items())}"
 
     def _put_back(self, config: pb.ModelConfig, versions: Sequence[int]) -> str | None:
-        """Restore a model's file and served versions. Return the reason of a failure: no server, or other models come
-        first.
+        """Restore a model's file and served versions. Return why this failed, or None.
+
+        A failure means that there is no server, or that other models come first.
         """
         try:
             self._write(serving_versions(config, versions) if versions else config)
@@ -174,9 +175,9 @@ class Rollout:
 
 
 def probe(server: RepositoryApi, config: pb.ModelConfig, version: int) -> None:
-    """Raise RepositoryApiError or RewardError unless the version answers synthetic samples with numbers.
+    """Raise RewardError or RepositoryApiError unless the version answers synthetic samples with numbers.
 
-    A model that writes its answers may also refuse a sample because the answer holds no score.
+    A model that answers in words may also refuse a sample because its answer holds no score.
     """
     reads = _dims(config.input)
     widths = None if wire.FRAMES in reads else (reads[wire.VIDEO_EMBEDDINGS], reads[wire.TEXT_EMBEDDING])
@@ -201,14 +202,14 @@ def probe(server: RepositoryApi, config: pb.ModelConfig, version: int) -> None:
 
 
 def check_files(repository: Path, models: Mapping[str, pb.ModelConfig | None]) -> None:
-    """Raise RolloutError for a model whose files are not whole. models: configurations; None: as in the file"""
+    """Raise RolloutError for a model with incomplete files. models: configurations; None: as in the file"""
     for model, config in models.items():
         if (fault := fault_in(repository, model, config)) is not None:
             raise RolloutError(fault)
 
 
 def _dims(tensors: Iterable[Any]) -> dict[str, int]:
-    """Last dimension of each tensor, by name."""
+    """Return each tensor's last dimension, by name."""
     return {tensor.name: tensor.dims[-1] for tensor in tensors}
 
 

@@ -26,11 +26,11 @@ from rfm_commands.rollout import names_of
 from rfm_export.publish import read_config
 from rfm_gateway import GatewayConfig
 
-LOG_FOLDER = Path(".local", "state", "rfm")  # in the home folder, as the XDG base directory specification has it
+LOG_FOLDER = Path(".local", "state", "rfm")  # in the home folder, as the XDG base directory specification says
 
 
 def log_file(named: Path | None, http_port: int, environment: Mapping[str, str]) -> Path | None:
-    """Return the file for Triton's lines; None: standard error, which is no terminal.
+    """Return the file for Triton's lines; None: standard error, which is not a terminal.
 
     named: the user's choice; None: no choice
     """
@@ -42,7 +42,7 @@ def log_file(named: Path | None, http_port: int, environment: Mapping[str, str])
 
 @contextmanager
 def opened(log: Path | None) -> Iterator[IO[bytes] | None]:
-    """Context manager with the file, to append to. Raises OSError."""
+    """Context manager with the file, opened for appending. Raises OSError."""
     if log is None:
         yield None
         return
@@ -53,7 +53,7 @@ def opened(log: Path | None) -> Iterator[IO[bytes] | None]:
 
 @dataclass
 class ServeScreen:
-    """The screen of one server.
+    """The screen for one server.
 
     gateway: the gateway beside it; None: no gateway
     log: file with Triton's lines
@@ -88,7 +88,7 @@ class ServeScreen:
         print("\n".join(["rfm serve: " + lines[0], *lines[1:]]), file=sys.stderr, flush=True)
 
     def _models(self) -> str:
-        """Each model with the versions that its file names."""
+        """Return each model with the versions that its file names."""
         shown = []
         for model in models_in(self.repository):
             try:
@@ -99,7 +99,7 @@ class ServeScreen:
         return ", ".join(shown)
 
     def _devices(self) -> str:
-        """The GPUs of all models, or the CPU."""
+        """Return the GPUs that all models use, or the CPU."""
         gpus: set[int] = set()
         for model in models_in(self.repository):
             try:

@@ -74,7 +74,7 @@ def steps_without_server(repository: Path, video: Path, task: str) -> list[tuple
 def score_video(endpoints: Endpoints, video: Path, frames: UInt8Array, task: str, picture: Path) -> None:
     """Score the video, print the table, and draw the plot.
 
-    frames: uint8 [T, H, W, 3], T frames of H x W pixels, evenly thinned if the checkpoint takes fewer
+    frames: uint8 [T, H, W, 3], T frames, H x W pixels, evenly thinned if the checkpoint takes fewer
     """
     from rfm_client.cli.pictures import Panel, plot
     from rfm_client.cli.scoring import checkpoint_of, heading
@@ -92,7 +92,7 @@ def score_video(endpoints: Endpoints, video: Path, frames: UInt8Array, task: str
 
 
 def _exported_frames(checkpoint: str, settings: ExportConfig, repository: Path) -> Path:
-    """Export the checkpoint, and return the repository. Fails if the checkpoint scores only embeddings."""
+    """Export the checkpoint and return the repository. Fails if the checkpoint scores only embeddings."""
     import rfm_export
 
     rfm_export.export(checkpoint, repository, settings)
@@ -102,7 +102,7 @@ def _exported_frames(checkpoint: str, settings: ExportConfig, repository: Path) 
 
 
 def _words(given: Given[Any]) -> list[str]:
-    """The options of a checkpoint, as they stand on a command line."""
+    """Return a checkpoint's options, as they stand on a command line."""
     words = []
     for name, value in given.items():
         option = CheckpointConfig.settings()[name].option

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Export of a checkpoint into a Triton model repository."""
+"""Export a checkpoint into a Triton model repository."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 else:
 
     def __getattr__(name: str) -> Any:
-        """Import an exporter function at its first use: the exporter needs PyTorch, which takes seconds to import."""
+        """Import exporter functions at first use: the exporter needs PyTorch, which takes seconds to import."""
         if name not in ("check", "export"):
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from rfm_export import exporter

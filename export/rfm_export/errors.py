@@ -5,8 +5,8 @@ from rfm_client.contract.errors import LocatedError
 
 
 class ExportError(LocatedError):
-    """An export that cannot be made, and the reason."""
+    """An export that cannot be made, and why."""
 
 
 class ExportDiffersError(ExportError):
-    """The export's scores differ from its checkpoint's, or are missing; nothing was published."""
+    """The export's scores differ from the checkpoint's, or are missing; nothing was published."""

@@ -53,11 +53,11 @@ def export(
 
     The staged files are loaded and compared with the checkpoint before the repository changes.
 
-    other_machine: True: another machine serves it, so ``num_gpus`` may exceed the GPUs of this machine
+    other_machine: True: another machine serves the export, so ``num_gpus`` may exceed this machine's GPUs
     family: package of the checkpoint's family, which the server must also be able to import; None: a built-in family
-    device: for the comparison of scores; None: the CPU, for a large network a GPU with room for it
-    say: takes a line for the user: the run's config.yaml, ``rfm.published.notes``, a derived ``max_batch_size``, the
-        device of a large network
+    device: where scores are compared; None: the CPU, for a large network a GPU with enough free memory
+    say: receives lines for the user: the run's config.yaml, ``rfm.published.notes``, a derived ``max_batch_size``, the
+        device for a large network
 
     Raises CheckpointError, ExportError.
     """
@@ -96,7 +96,7 @@ def _save(source: Source, version: Version, staged: Path) -> None:
 
 
 def check(repository: Path, settings: ExportConfig) -> list[str]:
-    """Return a line for each generated file that an export would now write differently. Raises ExportError."""
+    """Return a line per generated file that an export would now write differently. Raises ExportError."""
     scorer = settings.name if (repository / settings.name).exists() else frames_name(settings.name)
     config = _read_config(repository, scorer)
     try:
@@ -128,7 +128,7 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
 
 
 def _check_weights(folder: Path, weights: str | None, settings: ExportConfig) -> None:
-    """Raise ExportError if the settings name other weights than the export has: an export would write them anew."""
+    """Raise ExportError if the settings name other weights than the export has: a new export would rewrite them."""
     if settings.weights not in (None, weights):
         remedy = "leave out --weights, or export again"
         raise ExportError.at(folder, f"weights in {settings.weights}", weights or "full ones", remedy)
@@ -142,10 +142,10 @@ def _read_config(repository: Path, name: str) -> Any:
 
 
 def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], settings: ExportConfig) -> None:
-    """Raise ExportError for a model that would lose inputs or outputs, on which its clients rely.
+    """Raise ExportError for a model that would lose inputs or outputs on which clients rely.
 
     A model may gain an optional input, and a score that is newer than some exports (``Score.is_newer``), which clients
-    need not know. It may lose the input of frames' digests, without which clients send pixels.
+    need not know. It may lose the frame-digest input, without which clients send pixels.
     """
     names = {model.name for model in models}
     for name in (settings.name, encoder_name(settings.name), frames_name(settings.name)):

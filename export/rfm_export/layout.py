@@ -2,8 +2,8 @@
 """The models that serve a checkpoint, and all their generated files.
 
 A checkpoint that scores embeddings is the model ``<name>``. With encoders there are two more models:
-``<name>_encoder``, and ``<name>_frames``, the ensemble of both, which scores raw frames. A checkpoint that scores raw
-frames is the model ``<name>_frames`` alone.
+``<name>_encoder``, and ``<name>_frames``, an ensemble that joins the two and scores raw frames. A checkpoint that
+scores raw frames is the model ``<name>_frames`` alone.
 """
 
 from __future__ import annotations
@@ -57,11 +57,11 @@ class GeneratedModel:
 
     @property
     def is_ensemble(self) -> bool:
-        """True if it consists of other models."""
+        """True if the model consists of other models."""
         return self.model_file is None
 
     def files(self) -> dict[str, bytes]:
-        """Return contents by path in the repository."""
+        """Return file contents by path in the repository."""
         in_version = (KEEP_FILE, b"") if self.model_file is None else (MODEL_FILE, self.model_file)
         contents = {CONFIG_FILE: render(self.config).encode(), f"{self.version}/{in_version[0]}": in_version[1]}
         contents |= {f"{WARMUP_FOLDER}/{name}": content for name, content in self.warmup_files.items()}
@@ -70,7 +70,7 @@ class GeneratedModel:
 
 @dataclass(frozen=True)
 class Version:
-    """Settings that all models of an exported version share.
+    """Settings that all models in an exported version share.
 
     num_gpus: 0: the CPU
     family: package of the checkpoint's family
@@ -82,11 +82,11 @@ class Version:
     family: str
 
     def checkpoint_folder(self, description: Description, repository: Path) -> Path:
-        """Return the folder of the checkpoint's files."""
+        """Return the folder for the checkpoint's files."""
         return repository / scorer_name(description, self.settings.name) / str(self.number) / CHECKPOINT_FOLDER
 
     def encoders_folder(self, repository: Path) -> Path:
-        """Return the folder of the encoders' files."""
+        """Return the folder for the encoders' files."""
         return repository / encoder_name(self.settings.name) / str(self.number)
 
 
@@ -98,12 +98,12 @@ def generated_files(models: Sequence[GeneratedModel], repository: Path) -> dict[
 
 
 def scorer_name(description: Description, name: str) -> str:
-    """Return the name of the model with the checkpoint, for an export as ``name``."""
+    """Return the name that the checkpoint's model gets in an export as ``name``."""
     return frames_name(name) if description.widths is None else name
 
 
 def generated_models(description: Description, encoders: Description | None, version: Version) -> list[GeneratedModel]:
-    """Return the models of a checkpoint and its encoders, parts before their ensemble."""
+    """Return the models for a checkpoint and its encoders, parts before their ensemble."""
     name, widths, cache_mib = version.settings.name, description.widths, version.settings.feature_cache_mib
     # Two small networks keep a GPU busy: one scores while the other reads.
     several = widths is not None and version.num_gpus > 0
@@ -136,7 +136,7 @@ def generated_models(description: Description, encoders: Description | None, ver
 def _python_model(
     interface: Interface, template: str, version: Version, warmups: list[Warmup], *, keeps: bool
 ) -> GeneratedModel:
-    """keeps: True if the model keeps features of frames"""
+    """Build a Python model. keeps: True if the model keeps frame features"""
     model_file = resources.files("rfm_export") / "templates" / template / MODEL_FILE
     files = {name: content for warmup in warmups for name, content in warmup.files().items()}
     config = python_config(interface, version.settings, version.num_gpus, version.number, warmups)
@@ -147,7 +147,7 @@ def _python_model(
 
 
 def _warmups(description: Description) -> list[Warmup]:
-    """A sample of each type that the checkpoint can score; none if it may fail to."""
+    """Return a sample per type that the checkpoint can score; none if scoring may fail."""
     if description.may_not_answer:
         return []
     trajectory = blank_trajectory(description.widths, task=WARMUP_TASK)
@@ -169,7 +169,7 @@ def description_in(config: pb.ModelConfig) -> Description:
 
 
 def _record_digests(config: pb.ModelConfig, version: int, repository: Path) -> None:
-    """Set the digests of a version's weights and settings in ``repository``; an ensemble has those of its parts."""
+    """Set the digests of a version's weights and settings in ``repository``; an ensemble gets its parts' digests."""
     parts = [step.model_name for step in config.ensemble_scheduling.step] or [config.name]
     folders = [repository / part / str(version) for part in parts]
     kinds = [pb.ModelInstanceGroup.Kind.Name(group.kind) for group in config.instance_group]

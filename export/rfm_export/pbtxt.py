@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""config.pbtxt of each model, from the wire contract and the ExportConfig."""
+"""Each model's config.pbtxt, from the wire contract and the ExportConfig."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ HEADER = f"{EXPORT_HEADER}; `rfm export --check` compares it with what would be 
 
 @dataclass(frozen=True)
 class Interface:
-    """Name, inputs and outputs of a model, and the description that its clients read."""
+    """A model's name, inputs and outputs, and the description that clients read."""
 
     name: str
     inputs: tuple[TensorSpec, ...]
@@ -48,7 +48,7 @@ class Warmup:
     tensors: wire.Tensors
 
     def files(self) -> dict[str, bytes]:
-        """Return the files' contents by name; Triton makes tensors of zeros itself."""
+        """Return file contents by name; Triton itself makes tensors of zeros."""
         return {f"{self.name}.{name}": _raw(array[0]) for name, array in self.tensors.items() if not _is_zero(array)}
 
 
@@ -77,7 +77,7 @@ def python_config(
 def ensemble_config(
     interface: Interface, settings: ExportConfig, version: int, encoder: Interface, scorer: Interface
 ) -> pb.ModelConfig:
-    """Return an ensemble of encoder and scorer, both at the version of their export."""
+    """Return an ensemble of encoder and scorer, both at their export's version."""
     config = _config(interface, settings, version)
     config.platform = "ensemble"
     own = {spec.name for spec in (*interface.inputs, *interface.outputs)}
@@ -101,12 +101,12 @@ def serving_versions(config: pb.ModelConfig, versions: Sequence[int]) -> pb.Mode
 
 
 def render(config: pb.ModelConfig) -> str:
-    """Return the text of config.pbtxt for this configuration."""
+    """Return the configuration as config.pbtxt text."""
     return HEADER + str(text_format.MessageToString(config))
 
 
 def parse(text: str) -> pb.ModelConfig:
-    """Return the configuration of a config.pbtxt. Raises google.protobuf.text_format.ParseError."""
+    """Parse a config.pbtxt. Raises google.protobuf.text_format.ParseError."""
     return text_format.Parse(text, pb.ModelConfig())
 
 
@@ -124,7 +124,7 @@ def _config(interface: Interface, settings: ExportConfig, version: int) -> pb.Mo
 
 
 def _bound_queue(batching: pb.ModelDynamicBatching, settings: ExportConfig) -> None:
-    """Limit Triton's queue as the settings say. Triton answers 503 if it is full, or a request waits too long."""
+    """Limit Triton's queue. Triton answers 503 if the queue is full, or a request waits too long."""
     policy = batching.default_queue_policy
     if settings.max_queue_size is not None:
         policy.max_queue_size = settings.max_queue_size
@@ -154,7 +154,7 @@ def _is_zero(array: npt.NDArray[Any]) -> bool:
 
 
 def _raw(array: npt.NDArray[Any]) -> bytes:
-    """The bytes that Triton reads; each string follows its length."""
+    """Return the bytes that Triton reads; each string follows its length."""
     if array.dtype == np.object_:
         return b"".join(len(item).to_bytes(4, "little") + item for item in array.ravel())
     return array.tobytes()

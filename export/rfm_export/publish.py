@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Move staged models into the repository, which Triton can load at every moment.
+"""Move staged models into the repository so that Triton can load it at any moment.
 
 New version folders are written aside, then renamed, so they appear whole. Triton does not serve them until the
-configurations name them. The order of their replacement keeps every intermediate state consistent.
+configurations name them. Configurations are replaced in an order that keeps every intermediate state consistent.
 
 The scratch folder lies in the repository: no other folder need be writable, or on the same file system. Triton takes
-every folder of a repository for a model, unless its arguments name the models. Inside a model's folder, Triton ignores
-folders whose name is no number. So the scratch folder lies inside a model's folder; without
+every folder in a repository for a model, unless its arguments name the models. Inside a model's folder, Triton ignores
+folders whose name is not a number. So the scratch folder lies inside a model's folder; without
 models, in the repository itself.
 
 A model has one configuration for all versions, which names the newest version's checkpoint. So each version folder
-keeps the configuration of its export, for a later ``rollout``.
+keeps its export's configuration, for a later ``rollout``.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ _log = logging.getLogger(__name__)
 
 @contextmanager
 def alone(repository: Path) -> Iterator[None]:
-    """Lock the repository against other exports and rollouts, if its file system has locks.
+    """Lock the repository against other exports and rollouts, if its file system supports locks.
 
-    Removes scratch folders of killed processes. Raises ExportError while another export or rollout runs.
+    Removes scratch folders that killed processes left. Raises ExportError while another export or rollout runs.
     """
     _make_writable(repository)
     descriptor = os.open(repository, os.O_RDONLY)
@@ -66,7 +66,7 @@ def alone(repository: Path) -> Iterator[None]:
 
 
 def _make_writable(repository: Path) -> None:
-    """Make the folder, if need be. Raises ExportError for a folder that an export or rollout cannot change."""
+    """Make the folder if it is missing. Raises ExportError for a folder that an export or rollout cannot change."""
     try:
         if (repository / CONFIG_FILE).exists():
             raise ExportError.at(repository, "a repository", f"a model of one: --repository {repository.parent}")
@@ -83,7 +83,7 @@ def _make_writable(repository: Path) -> None:
 def staging(repository: Path, names: Sequence[str]) -> Iterator[Path]:
     """Yield a scratch folder in the repository, and remove it after the block.
 
-    names: models that change; the folder lies in the first of them that exists, because a new folder makes Triton
+    names: models that change; the folder lies in the first one that exists, because a new folder makes Triton
         reload a model at a load request
     """
     changing = [repository / name for name in names if (repository / name / CONFIG_FILE).is_file()]
@@ -99,7 +99,7 @@ def _models(repository: Path) -> list[Path]:
 
 
 def next_version(repository: Path, names: Sequence[str]) -> int:
-    """Return the highest version of any of the models, plus 1."""
+    """Return the models' highest version, plus 1."""
     folders = (path for name in names for path in (repository / name).glob("*"))
     return 1 + max((int(path.name) for path in folders if path.name.isdecimal()), default=0)
 
@@ -110,7 +110,7 @@ def read_config(repository: Path, name: str) -> pb.ModelConfig:
 
 
 def config_of(repository: Path, name: str, version: int) -> pb.ModelConfig:
-    """Return the configuration that serves only this version of a model. Raises OSError, ParseError."""
+    """Return the configuration that serves only this version. Raises OSError, ParseError."""
     kept = repository / name / str(version) / CONFIG_FILE
     current = read_config(repository, name)
     if version in current.version_policy.specific.versions and not kept.exists():  # its export kept none
@@ -119,7 +119,7 @@ def config_of(repository: Path, name: str, version: int) -> pb.ModelConfig:
 
 
 def replace_config(repository: Path, config: pb.ModelConfig, scratch: Path) -> None:
-    """Replace a configuration in one step: readers never see a part.
+    """Replace a configuration atomically: readers never see a part.
 
     scratch: a folder on the same file system
     """
@@ -161,7 +161,7 @@ def publish(repository: Path, staged: Path, models: Sequence[GeneratedModel]) ->
 
 
 def _settle(staged: Path) -> None:
-    """Flush all files to the disk, so that a power cut leaves no partial file. Raises ExportError for a link."""
+    """Flush all files to disk, so that a power cut leaves no partial file. Raises ExportError for a link."""
     for path in (staged, *staged.rglob("*")):
         if path.is_symlink():
             raise ExportError.at(path, "a file or folder", "a link")

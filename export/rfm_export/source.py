@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Read a checkpoint, check what the user asks for, and tell where the checkpoint comes from: all that an export needs.
+"""Everything that an export needs: read a checkpoint, check the user's settings, and record the checkpoint's origin.
 
 ``max_batch_size`` is the largest batch that still makes a GPU score more samples a second. Small batches leave a GPU
 idle while the CPU launches kernels. From about SATURATING_FLOP on, each further sample adds its full time: on an H200,
-8 samples of a Robometer-4B take 16 ms each, and so do 32. A larger batch gains nothing, makes every caller wait for its
-end, and leaves nothing to the other GPUs.
+8 samples of a Robometer-4B take 16 ms each, and so do 32. A larger batch gains nothing, makes every caller wait for the
+whole batch, and leaves nothing to the other GPUs.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from rfm_export.errors import ExportError
 from rfm_export.layout import description_in
 from rfm_export.pbtxt import parse
 
-Say: TypeAlias = Callable[[str], object]  # takes a line for the user
+Say: TypeAlias = Callable[[str], object]  # receives a line for the user
 
-SATURATING_FLOP = 20e12  # of matrix products
+SATURATING_FLOP = 20e12  # in matrix products
 MOST_SAMPLES = 64  # small networks hardly gain from more
 TYPICAL_FRAMES, TYPICAL_PX = 8, 224
 TYPICAL_TASK = "put the red block in the bowl"
@@ -53,12 +53,12 @@ _SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # for
 
 @dataclass(frozen=True)
 class Source:
-    """The checked input of an export.
+    """The checked input for an export.
 
-    description, of_encoders: of the checkpoint and of its encoders, without digests, whose files do not exist yet
+    description, of_encoders: describe the checkpoint and its encoders, without digests: the files do not exist yet
     settings: with a ``max_batch_size``
-    num_gpus: that serve the export; 0: the CPU
-    device: for the comparison of scores, as the user names it; None: the default
+    num_gpus: GPUs that serve the export; 0: the CPU
+    device: where scores are compared, as the user names it; None: the default
     full: loads the checkpoint with full weights; None: the settings round nothing
     """
 
@@ -77,7 +77,7 @@ class Source:
 def read_for_export(
     source: str | Path, settings: ExportConfig, family: str | None, device: str | None, say: Say, *, other_machine: bool
 ) -> Source:
-    """Read and check all that an export needs, before it writes. Parameters and errors as of ``export``."""
+    """Read and check all that an export needs, before it writes. Parameters and errors: see ``export``."""
     if not other_machine:
         _check_gpus(settings.num_gpus)
     named = None if device is None else device_named(device)
@@ -87,7 +87,7 @@ def read_for_export(
 
 
 def read_source(source: str | Path, settings: ExportConfig, family: str | None, say: Say) -> Source:
-    """Read a checkpoint. Tell the user the file of the training run's settings, and possible faults."""
+    """Read a checkpoint. Tell the user which file has the training run's settings, and about possible faults."""
     folder = published.find(source, say)
     kind = published.choose(folder, family, settings)
     loaded = published.read_from(folder, kind, settings)
@@ -114,7 +114,7 @@ def _full(folder: Path, family: Family, settings: ExportConfig) -> Checkpoint:
 
 
 def device_named(name: str) -> torch.device:
-    """Return the device of this name. Raises ExportError if this machine does not have it."""
+    """Return the device with this name. Raises ExportError if this machine does not have it."""
     there, why = ["cpu"], f": PyTorch {torch.__version__} finds no GPU; --device cpu"
     if torch.cuda.is_available():
         there, why = ["cpu", "cuda", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))], ""
@@ -142,14 +142,14 @@ def _check_graphs(settings: ExportConfig, description: Description) -> None:
 
 
 def num_gpus(settings: ExportConfig) -> int:
-    """Return the number of GPUs that serve the export; 0: the CPU."""
+    """Return how many GPUs serve the export; 0: the CPU."""
     return torch.cuda.device_count() if settings.num_gpus is None else settings.num_gpus
 
 
 def with_batch_size(settings: ExportConfig, checkpoint: Checkpoint, say: Say) -> ExportConfig:
     """Return the settings with a ``max_batch_size``: the user's, else the saturating one.
 
-    say: takes a line for the user about a number below MOST_SAMPLES
+    say: receives a line for the user about a number below MOST_SAMPLES
     Raises CheckpointError.
     """
     if settings.max_batch_size is not None:
@@ -166,13 +166,13 @@ def with_batch_size(settings: ExportConfig, checkpoint: Checkpoint, say: Say) ->
 
 
 def saturating_samples(flop: float) -> int:
-    """Return the power of two, from 1 to MOST_SAMPLES, that comes nearest to SATURATING_FLOP. flop: of one sample"""
+    """Return the power of two, 1 to MOST_SAMPLES, that comes nearest to SATURATING_FLOP. flop: per sample"""
     power = round(math.log2(SATURATING_FLOP / max(flop, 1.0)))
     return int(2 ** min(max(power, 0), math.log2(MOST_SAMPLES)))
 
 
 def typical_sample(checkpoint: Checkpoint) -> ProgressSample:
-    """Return a progress sample with the frames of training, else TYPICAL_FRAMES."""
+    """Return a progress sample with as many frames as in training, else TYPICAL_FRAMES."""
     description = checkpoint.description
     num_frames = description.trained_frames or TYPICAL_FRAMES
     if description.network_frames is not None:
@@ -185,10 +185,10 @@ def typical_sample(checkpoint: Checkpoint) -> ProgressSample:
 def origin_of(source: str | Path, folder: Path, computation: str) -> Origin:
     """Return the checkpoint's origin: source, commit, training run's config.yaml, licence, effect of rounded weights.
 
-    The source of a folder is the end of its path. config.yaml becomes JSON without secrets.
+    For a folder, the source is the end of its path. config.yaml becomes JSON without secrets.
 
     source: as the user named it
-    folder: the checkpoint's files, from the Hub in a snapshot named by its commit
+    folder: the checkpoint's files; from the Hub, a snapshot named by its commit
     computation: as in ``Origin``
     """
     file = find_run_config(folder)
@@ -204,12 +204,12 @@ def origin_of(source: str | Path, folder: Path, computation: str) -> Origin:
 
 def _earlier_difference(folder: Path) -> float | None:
     """Return the difference that an export measured when it wrote this folder; None: not measured, or no export."""
-    kept = folder.parent / CONFIG_FILE  # in the folder of the version
+    kept = folder.parent / CONFIG_FILE  # in the version folder
     if folder.name != CHECKPOINT_FOLDER or not kept.is_file():
         return None
     try:
         return description_in(parse(kept.read_text())).weights_difference
-    except (ParseError, ValueError):  # an export of before there were descriptions measured nothing
+    except (ParseError, ValueError):  # exports from before descriptions existed measured nothing
         return None
 
 
@@ -219,17 +219,17 @@ def origin_in(description: Description) -> Origin:
 
 
 def described(checkpoint: Checkpoint, origin: Origin) -> Description:
-    """Return the checkpoint's description without the digests of weights and settings, whose files do not exist yet."""
+    """Return the checkpoint's description without digests for weights and settings: those files do not exist yet."""
     return replace(checkpoint.description, **vars(origin), network=_network(checkpoint))
 
 
 def described_encoders(encoders: Description, origin: Origin) -> Description:
-    """Return the description of encoders, exported with a scorer of this origin."""
+    """Return the description for encoders that are exported with a scorer from this origin."""
     return replace(encoders, source=origin.source, revision=origin.revision)
 
 
 def _public(value: Any) -> Any:
-    """A YAML value in JSON's types, without texts whose keys name a secret."""
+    """Return a YAML value in JSON types, without texts whose keys name a secret."""
     if isinstance(value, dict):
         kept = {str(key): inner for key, inner in value.items() if not _is_secret(str(key), inner)}
         return {key: _public(inner) for key, inner in kept.items()}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Compare the scores of an exported model with its checkpoint's, on a device that has room."""
+"""Compare an exported model's scores with its checkpoint's, on a device with enough memory."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def _compare_staged(source: Source, version: Version, staged: Path, say: Say) ->
 def device_for(checkpoint: Checkpoint, dtype: torch.dtype | None, *, may_use_gpu: bool) -> torch.device:
     """Return the default device: the CPU, for a large network the GPU with most free memory, if enough.
 
-    dtype: of the network on the device; None: the weights' own
+    dtype: the network's type on the device; None: the weights' own
     """
     if not (checkpoint.description.is_large and may_use_gpu and torch.cuda.is_available()):
         return torch.device("cpu")
@@ -105,7 +105,7 @@ def device_for(checkpoint: Checkpoint, dtype: torch.dtype | None, *, may_use_gpu
 
 
 def _bytes(weight: torch.Tensor, dtype: torch.dtype | None) -> int:
-    """Return the bytes of a weight in a network of ``dtype``; rounded weights stay as they are."""
+    """Return a weight's bytes in a network with ``dtype``; rounded weights stay as they are."""
     return weight.numel() * (dtype if dtype and weight.is_floating_point() else weight.dtype).itemsize
 
 
@@ -128,7 +128,7 @@ def needing_room(device: torch.device) -> Iterator[None]:
 
 
 def probes(description: Description, *, with_encoders: bool, seed: int = 0) -> list[Sample]:
-    """Return random samples of each type that the checkpoint can score, in several lengths.
+    """Return random samples in several lengths for each type that the checkpoint can score.
 
     with_encoders: True: for a checkpoint that scores embeddings, raw frames too
     """
@@ -189,12 +189,12 @@ def largest_difference(
 
 
 def verify_graphs(make: Callable[[], Engine], description: Description, say: Say) -> None:
-    """Raise ExportDiffersError unless CUDA graphs give the scores of plain passes.
+    """Raise ExportDiffersError unless CUDA graphs give the same scores as plain passes.
 
-    Each sample, and another of the same shapes, is scored alone: first by plain passes, then by graphs.
+    Each sample, and another with the same shapes, is scored alone: first by plain passes, then by graphs.
 
     make: returns an engine with CUDA graphs, which has not scored yet
-    say: takes a line for the user
+    say: receives a line for the user
     """
     engine = make()
     if engine.graphs is None:
@@ -228,12 +228,12 @@ def _scaled_difference(got: npt.NDArray[np.float64], expected: npt.NDArray[np.fl
 
 
 def _numbers(index: int, whose: str, outcome: Outcome) -> npt.NDArray[np.float64]:
-    """All scores of a probe, concatenated."""
+    """Return all scores for a probe, concatenated."""
     return np.concatenate([*_arrays(index, whose, outcome).values()])
 
 
 def _arrays(index: int, whose: str, outcome: Outcome) -> dict[str, npt.NDArray[np.float64]]:
-    """All scores of a probe, by name."""
+    """Return all scores for a probe, by name."""
     if isinstance(outcome, RewardError):
         raise ExportDiffersError.at(f"probe {index}", f"scores of {whose}", outcome) from outcome
     answers = {name: np.array([number], np.float64) for name, number in answer(outcome).items()}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where Triton listens, perhaps with TLS, and the key of its restricted APIs."""
+"""Where Triton listens, with or without TLS, and the key for its restricted APIs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from rfm_client.contract.wire import ADMIN_KEY_VARIABLE
 VARIABLE = ADMIN_KEY_VARIABLE
 HEADER = "rfm-admin-key"
 MIN_CHARACTERS = 16
-_GRPC_PREFIX = "triton-grpc-protocol-"  # Triton puts it before the name
+_GRPC_PREFIX = "triton-grpc-protocol-"  # Triton puts it before the header name
 _RESTRICTED = "model-repository,logging,trace"
 _RANDOM_BYTES = 32
 _VISIBLE = re.compile("[!-~]*")  # characters that a header can carry unchanged
@@ -38,7 +38,7 @@ def new_key() -> str:
 def take_key(file: Path | None, environment: MutableMapping[str, str]) -> str | None:
     """Return the key in ``file``, else the key in ``environment``, else None. Raises InvalidValueError.
 
-    Removes the key from ``environment``, so that no child process gets it.
+    Removes the key from ``environment``, so that no child process inherits it.
     """
     given = environment.pop(VARIABLE, None)
     if file is not None:
@@ -47,26 +47,26 @@ def take_key(file: Path | None, environment: MutableMapping[str, str]) -> str | 
 
 
 def restrictions(key: str) -> list[str]:
-    """Return arguments of tritonserver that refuse administrative requests without ``key``."""
+    """Return tritonserver arguments that refuse administrative requests without ``key``."""
     return [
         f"--{option}={_RESTRICTED}:{HEADER}={key}" for option in ("http-restricted-api", "grpc-restricted-protocol")
     ]
 
 
 def http_headers(key: str | None) -> Mapping[str, str]:
-    """Return the headers of an HTTP request to a restricted API."""
+    """Return the HTTP headers for a restricted API."""
     return {} if key is None else {HEADER: key}
 
 
 def grpc_metadata(key: str | None) -> Mapping[str, str]:
-    """Return the metadata of a gRPC request to a restricted API."""
+    """Return the gRPC metadata for a restricted API."""
     return {} if key is None else {f"{_GRPC_PREFIX}{HEADER}": key}
 
 
 def _read(file: Path) -> str:
-    """Return the key in a file with permissions as strict as PostgreSQL demands of a private key.
+    """Return the key from a file with permissions as strict as PostgreSQL requires for a private key.
 
-    Only the owner may read it. The group may also read a file that root owns, since containers get secrets that way.
+    Only the owner may read the file. If root owns it, the group may too: containers get secrets that way.
     """
     try:
         status = file.stat()
@@ -87,22 +87,22 @@ def _read(file: Path) -> str:
 def _checked(text: str, where: str) -> str:
     key = text.strip()
     require(where, len(key) >= MIN_CHARACTERS, f"at least {MIN_CHARACTERS} characters", len(key))
-    require(where, bool(_VISIBLE.fullmatch(key)), "visible ASCII characters without spaces", "others")  # shows no key
+    require(where, bool(_VISIBLE.fullmatch(key)), "visible ASCII characters without spaces", "others")  # hides the key
     return key
 
 
-PORTS = range(20_000, 32_000)  # below the ports that Linux gives to outgoing connections
-PORT_STEP = 20  # the defaults stay different from each other
+PORTS = range(20_000, 32_000)  # below the ports that Linux assigns to outgoing connections
+PORT_STEP = 20  # keeps the three defaults distinct
 SECURITY_FLOOR = (
     2,
     71,
-)  # NVIDIA's container 26.07; earlier versions have remote vulnerabilities: docs/guides/deploy.md, "Ports"
-_given: deque[int] = deque(maxlen=256)  # ports whose servers may not listen yet
+)  # Triton of NVIDIA's container 26.07; earlier versions have remote vulnerabilities: docs/guides/deploy.md, "Ports"
+_given: deque[int] = deque(maxlen=256)  # ports handed out, whose servers may not listen yet
 
 
 @dataclass(frozen=True)
 class GrpcTls:
-    """PEM files for gRPC with TLS. client_ca: authorities of client certificates; None: clients need no certificate"""
+    """PEM files for gRPC with TLS. client_ca: authorities that sign client certificates; None: clients need none"""
 
     certificate: Path
     key: Path
@@ -115,7 +115,7 @@ class GrpcTls:
             check_authorities(self.client_ca, "grpc_client_ca")
 
     def arguments(self) -> list[str]:
-        """Return arguments of tritonserver for gRPC with TLS."""
+        """Return tritonserver arguments for gRPC with TLS."""
         files = [f"--grpc-server-cert={self.certificate}", f"--grpc-server-key={self.key}"]
         if self.client_ca is None:
             return ["--grpc-use-ssl=true", *files]
@@ -124,7 +124,7 @@ class GrpcTls:
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Addresses of a server. grpc_tls: for gRPC; Triton has no TLS for HTTP, which then listens on 127.0.0.1 only"""
+    """Addresses of a server. grpc_tls: for gRPC only; Triton's HTTP has no TLS and then listens on 127.0.0.1"""
 
     host: str = DEFAULT_HOST
     http_port: int = 8000
@@ -134,9 +134,9 @@ class Endpoints:
 
     @classmethod
     def of(cls, config: ServeConfig, gateway_port: int | None = None) -> Endpoints:
-        """Return the endpoints of a configuration.
+        """Return the configured endpoints.
 
-        A port of Triton that is None becomes Triton's default, or 20 more while another setting names that port.
+        A Triton port that is None becomes Triton's default, plus 20 (repeatedly) if another setting uses that port.
         """
         named = {config.http_port, config.grpc_port, config.metrics_port, config.status_port, gateway_port}
         defaults = {"http_port": cls.http_port, "grpc_port": cls.grpc_port, "metrics_port": cls.metrics_port}
@@ -157,26 +157,26 @@ class Endpoints:
 
     @property
     def http_host(self) -> str:
-        """Address of the HTTP port."""
+        """Address that the HTTP port listens on."""
         return self.host if self.grpc_tls is None else DEFAULT_HOST
 
     @property
     def http_url(self) -> str:
-        """URL of the server over HTTP, for RewardClient."""
+        """Server URL for HTTP, for RewardClient."""
         return f"http://{in_url(self.http_host)}:{self.http_port}"
 
     @property
     def grpc_url(self) -> str:
-        """URL of the server over gRPC, for RewardClient."""
+        """Server URL for gRPC, for RewardClient."""
         return f"{'grpc' if self.grpc_tls is None else 'grpcs'}://{in_url(self.host)}:{self.grpc_port}"
 
     @property
     def metrics_url(self) -> str:
-        """URL of Triton's metrics, for Prometheus."""
+        """URL where Prometheus reads Triton's metrics."""
         return f"http://{in_url(self.host)}:{self.metrics_port}/metrics"
 
     def arguments(self) -> list[str]:
-        """Return arguments of tritonserver for these addresses."""
+        """Return tritonserver arguments for these addresses."""
         return [
             f"--http-address={_of_http_server(self.http_host)}",
             f"--http-port={self.http_port}",
@@ -203,7 +203,7 @@ class Endpoints:
 
 
 def check_version(host: str, version: str, *, accepted: bool) -> None:
-    """Raise ServerStartError for a vulnerable Triton on an address beyond loopback, unless ``accepted``."""
+    """Raise ServerStartError for a vulnerable Triton that listens beyond loopback, unless ``accepted``."""
     match = re.match(r"(\d+)\.(\d+)", version)
     is_safe = match is not None and (int(match[1]), int(match[2])) >= SECURITY_FLOOR
     if is_safe or accepted or is_loopback(host):
@@ -217,7 +217,7 @@ def check_version(host: str, version: str, *, accepted: bool) -> None:
 
 
 def free_ports(count: int) -> list[int]:
-    """Return free ports of the loopback address. Raises OSError if there are too few."""
+    """Return free loopback ports. Raises OSError if there are too few."""
     tried = random.SystemRandom().sample(PORTS, len(PORTS))
     ports = list(islice((port for port in tried if port not in _given and _is_free(port)), count))
     if len(ports) < count:
@@ -235,5 +235,5 @@ def _is_free(port: int) -> bool:
 
 
 def _of_http_server(host: str) -> str:
-    """Return the address for Triton's HTTP servers, which need a prefix before IPv6."""
+    """Return the address as Triton's HTTP servers expect it: IPv6 needs a prefix."""
     return f"ipv6:{host}" if ":" in host else host

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Find tritonserver: an explicit path, PATH, or the nvidia-pytriton wheel.
 
-From the wheel only the binary is used. It lacks a backend directory with the stub of the running Python, and the
-search path of its libraries and of libpython. This module adds both.
+Only the wheel's binary is used. The wheel lacks a backend directory with the running Python's stub, and the search path
+for its libraries and libpython. This module adds both.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from rfm_client.contract.errors import LocatedError
 
 EXECUTABLE = "tritonserver"
 WHEEL = "nvidia-pytriton"
-WHEEL_VERSION = "2.51.0"  # Triton's version in it
+WHEEL_VERSION = "2.51.0"  # the Triton version that it contains
 _BACKEND_FILES = ("libtriton_python.so", "triton_python_backend_utils.py")
 _STUB = "triton_python_backend_stub"
 
 
 class ServerStartError(LocatedError):
-    """tritonserver cannot start. Its message is one line. model: the model at fault; None: no model"""
+    """tritonserver cannot start. The message is one line. model: the model at fault; None: no model"""
 
     def __init__(self, problem: str, where: object = "", model: str | None = None) -> None:
         super().__init__(problem, where)
@@ -58,7 +58,7 @@ class Installation:
 
 
 def find_installation(executable: Path | None = None) -> Installation:
-    """Return the installation of ``executable``, else of PATH, else of the wheel. Raises ServerStartError."""
+    """Find the installation: ``executable``, else the one on PATH, else the wheel. Raises ServerStartError."""
     if executable is not None:
         if not (executable.is_file() and os.access(executable, os.X_OK)):
             raise ServerStartError.at("tritonserver", f"a program at {executable}", "none")
@@ -75,11 +75,11 @@ def _wheel_installation() -> Installation:
     wheel = Path(package.submodule_search_locations[0]) / EXECUTABLE
     numpy_version = importlib.metadata.version("numpy")
     if int(numpy_version.partition(".")[0]) >= 2:
-        # With numpy 2, this release's stub returns empty outputs without an error.
+        # With numpy 2, this stub silently returns empty outputs.
         raise ServerStartError.at("numpy", f"< 2 with the Triton of {WHEEL}", f"{numpy_version}: pip install 'numpy<2'")
     _stub(wheel)
     library_folders = (wheel.parent.parent / "nvidia_pytriton.libs", _libpython().parent)
-    # The stub takes its Python environment from the first python3 in PATH.
+    # The stub takes its Python environment from the first python3 on PATH.
     environment = {
         "LD_LIBRARY_PATH": _prepended("LD_LIBRARY_PATH", *library_folders),
         "PATH": _prepended("PATH", Path(sys.executable).parent),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Ask a running Triton: HTTP requests that bound their time, and a probe of each model."""
+"""Ask a running Triton: HTTP requests with a time limit, and a probe per model."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from rfm.probe_request import probe_request
 from rfm_client.contract import wire
 from rfm_client.contract.wire import PROBE_PREFIX
 
-PROBE_TIMEOUT_S = 1.0  # for answers without a model
+PROBE_TIMEOUT_S = 1.0  # for requests that involve no model
 
 
 class UnreadableAnswerError(Exception):
-    """An answer with a status other than 200, or without JSON."""
+    """A response with a status other than 200, or without JSON."""
 
 
 NO_ANSWER = (OSError, http.client.HTTPException, UnreadableAnswerError)
 
 
 class Http:
-    """The server at ``host:port``. Its methods raise NO_ANSWER.
+    """HTTP client for ``host:port``. All methods raise NO_ANSWER.
 
     headers: sent with each request
     """
@@ -37,7 +37,7 @@ class Http:
         self._address, self._headers = (host, port), headers or {}
 
     def request(self, method: str, path: str, timeout_s: float, body: bytes | None = None) -> tuple[int, str]:
-        """Send a request. Return status and content of the answer."""
+        """Send a request. Return the response's status and body."""
         connection = http.client.HTTPConnection(*self._address, timeout=timeout_s)
         try:
             connection.request(method, path, body, self._headers)
@@ -47,7 +47,7 @@ class Http:
             connection.close()
 
     def json(self, path: str, timeout_s: float = PROBE_TIMEOUT_S, method: str = "GET") -> Any:
-        """Send a request. Return the JSON of the answer."""
+        """Send a request. Return the response's JSON."""
         status, text = self.request(method, path, timeout_s)
         if status != http.client.OK:
             raise UnreadableAnswerError(f"{path}: {status} {text}")
@@ -57,34 +57,34 @@ class Http:
             raise UnreadableAnswerError(f"{path}: {error}") from error
 
 
-BROKEN_COUNT, BROKEN_S = 3, 30.0  # a model is broken after so many failed probes in a row, over so long
-SHARE = 0.1  # largest share of a model's time
+BROKEN_COUNT, BROKEN_S = 3, 30.0  # a model is broken after BROKEN_COUNT failed probes in a row, over BROKEN_S
+SHARE = 0.1  # probes take at most this share of a model's time
 _OUTPUTS = (wire.PROGRESS, wire.VIDEO_EMBEDDINGS)
 
 
 class Probe:
-    """Probes a model in its own thread, every ``interval_s`` or less often if answers take long.
+    """Probes a model in its own thread every ``interval_s``, or less often if responses are slow.
 
-    hang_s: seconds without an answer after which the model counts as hung
+    hang_s: a model without a response for this long counts as hung
     """
 
     def __init__(self, http: Http, model: str, interval_s: float, hang_s: float) -> None:
         self._http, self._model, self._interval_s, self._hang_s = http, model, interval_s, hang_s
         self._waiting_since_s = time.monotonic()
-        self._num_failures: int | None = None  # in a row; None: no probe has succeeded yet
+        self._num_failures: int | None = None  # failures in a row; None: no probe has succeeded yet
         self._succeeded_s = 0.0  # time of the last success
         self.has_answered = False
         self._closed = threading.Event()
         threading.Thread(target=self._run, name=f"rfm-probe-{model}", daemon=True).start()
 
     def close(self) -> None:
-        """End the probes and their thread."""
+        """Stop probing and end the thread."""
         self._closed.set()
 
     def fault(self, progress_s: float) -> str | None:
-        """Return the reason to restart the model; None: it is healthy.
+        """Return the reason to restart the model; None: healthy.
 
-        progress_s: monotonic time of the last answer or forward pass in Triton's counts; a busy model may answer
+        progress_s: monotonic time of the last response or forward pass that Triton counted; a busy model may answer
             probes late
         """
         fails_s = time.monotonic() - self._succeeded_s
@@ -136,6 +136,6 @@ class Probe:
 
 
 def can_be_probed(config: Mapping[str, Any]) -> bool:
-    """True for a Python model of this project."""
+    """True for a Python model that this project exported."""
     names = {tensor["name"] for tensor in config["input"]}
     return config.get("backend") == "python" and wire.NUM_FRAMES in names

@@ -24,7 +24,7 @@ from rfm.serve.installation import ServerStartError
 
 EXIT_TIMEOUT_S = 10  # for requests in flight; Triton also waits this long for a dead model process
 KILL_AFTER_S = 2 * EXIT_TIMEOUT_S
-REAP_S, POLL_S = 5.0, 0.02  # a driver or a disk may keep a killed process for longer
+REAP_S, POLL_S = 5.0, 0.02  # a driver or a disk may hold a killed process for longer
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SIGNALS = {each.value: each.name for each in signal.Signals}
 _SENTINEL = ("/bin/sh", "-c", "trap '' HUP INT TERM; read _; kill -KILL 0")  # 0: its process group
@@ -32,7 +32,7 @@ _SENTINEL = ("/bin/sh", "-c", "trap '' HUP INT TERM; read _; kill -KILL 0")  # 0
 
 @contextmanager
 def stop_signals_to(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """Context manager in which ``handler`` takes SIGINT, SIGTERM and SIGHUP. For the main thread."""
+    """Context manager in which ``handler`` receives SIGINT, SIGTERM and SIGHUP. For the main thread."""
     previous = {number: signal.signal(number, handler) for number in _STOP_SIGNALS}
     try:
         yield
@@ -42,10 +42,10 @@ def stop_signals_to(handler: Callable[[int, FrameType | None], object]) -> Itera
 
 
 class ProcessGroup:
-    """A process and all that it starts. They end with this process, even if SIGKILL ends it.
+    """A process and everything that it starts. They end with this process, even if SIGKILL ends it.
 
-    A shell leads the group. It reads a pipe that only this process can write, and kills the group at the end of the
-    pipe. Until ``end``, no other group can have its id.
+    A shell leads the group. Only this process can write to the pipe that the shell reads. When the pipe closes, the
+    shell kills the group. No other group can take the id until ``end``.
     """
 
     def __init__(self, command: Sequence[str | os.PathLike[str]], **options: Any) -> None:
@@ -56,7 +56,7 @@ class ProcessGroup:
             self.process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
-                preexec_fn=partial(os.setpgid, 0, self.id),  # so that only this process passes on a Ctrl-C
+                preexec_fn=partial(os.setpgid, 0, self.id),  # a Ctrl-C reaches this process alone, which passes it on
                 restore_signals=False,  # SIGPIPE stays ignored: a log that nobody reads ends no process
                 **options,
             )
@@ -65,13 +65,13 @@ class ProcessGroup:
             raise
 
     def kill(self) -> None:
-        """Kill all processes of the group."""
-        if self._sentinel.returncode is None:  # else the id may be another group's
+        """Kill every process in the group."""
+        if self._sentinel.returncode is None:  # else another group may have the id
             os.killpg(self.id, signal.SIGKILL)
 
     def end(self) -> None:
-        """End the process gracefully, by force after KILL_AFTER_S, then all others."""
-        if self._sentinel.returncode is not None:  # they have ended
+        """End the process gracefully, by force after KILL_AFTER_S, then the rest of the group."""
+        if self._sentinel.returncode is not None:  # all have ended
             return
         self.process.terminate()
         with suppress(subprocess.TimeoutExpired):
@@ -83,37 +83,37 @@ class ProcessGroup:
             while time.monotonic() < ends_s:  # orphans, too: the first process of a container inherits them
                 if os.waitpid(-self.id, os.WNOHANG) == (0, 0):
                     time.sleep(POLL_S)
-        self._sentinel.communicate()  # closes the pipe, and notes the end
+        self._sentinel.communicate()  # closes the pipe, and records that the shell has ended
 
 
 def how_it_ended(status: int) -> str:
-    """Return an exit status in words. status: as of Popen, negative after a signal"""
+    """Return an exit status in words. status: as from Popen, negative after a signal"""
     return f"killed by {_SIGNALS.get(-status, -status)}" if status < 0 else f"exit status {status}"
 
 
-UNKNOWN = ""  # the model of a process that died before the first look
+UNKNOWN = ""  # model name for a process that died before the first look
 LOADING_DEAD_S = 5.0  # Triton ends a failed load within about 1 s, unless the process died before its handshake
 _PROGRAM = "triton_python_backend_stub"
 _STATES = {psutil.STATUS_ZOMBIE: "a process of it is dead", psutil.STATUS_STOPPED: "a process of it is stopped"}
 
 
 class ModelProcesses:
-    """The model processes of a Triton, one for each instance, from /proc.
+    """Triton's model processes, one per instance, from /proc.
 
-    Triton notices the death of a served model's process only at the next request, and keeps a zombie until then. If a
-    loading model's process dies before its handshake, Triton never notices. A process that is replaced may be a zombie
+    Triton notices that a served model's process has died only at the next request, and keeps a zombie until then. It
+    never notices if a loading model's process dies before its handshake. A process that Triton replaces may be a zombie
     for seconds.
     """
 
     def __init__(self, triton_pid: int) -> None:
         self._triton_pid = triton_pid
-        self._models: dict[int, str] = {}  # by process; a zombie's command line is empty
-        self._since_s: dict[int, float] = {}  # of dead and stopped processes
+        self._models: dict[int, str] = {}  # by process id; a zombie has no command line
+        self._since_s: dict[int, float] = {}  # when a process was first seen dead or stopped
 
     def fault(self, wanted: Mapping[str, int] | None = None, *, is_settled: bool = False) -> tuple[str, str] | None:
-        """Return a model and the fault of its process: dead or stopped.
+        """Return a model whose process is dead or stopped, and which of the two.
 
-        wanted: number of processes by model; while so many live, a dead one was replaced
+        wanted: process count by model; a dead process counts as replaced while this many live
         is_settled: no model loads or unloads: a fault counts at the second look, otherwise after LOADING_DEAD_S
         """
         states, now_s = self._states(), time.monotonic()
@@ -130,16 +130,16 @@ class ModelProcesses:
         return None
 
     def _states(self) -> dict[int, str]:
-        """Return the state of each model process, and note its model."""
+        """Return the state of each model process, and record its model."""
         states: dict[int, str] = {}
         for pid in children_of(self._triton_pid):
-            with suppress(psutil.NoSuchProcess):  # it has ended
+            with suppress(psutil.NoSuchProcess):  # the process has ended
                 process = psutil.Process(pid)
                 state = process.status()
                 words = [] if state == psutil.STATUS_ZOMBIE else process.cmdline()
                 if len(words) > 1 and words[0].endswith(_PROGRAM):  # then .../MODEL/VERSION/model.py
                     self._models[pid] = Path(words[1]).parent.parent.name
-                elif state == psutil.STATUS_ZOMBIE:  # also if it died before it was the program
+                elif state == psutil.STATUS_ZOMBIE:  # also if it died before it ran the program
                     self._models.setdefault(pid, UNKNOWN)
                 if pid in self._models:
                     states[pid] = state
@@ -148,9 +148,9 @@ class ModelProcesses:
 
 
 def children_of(pid: int) -> Iterator[int]:
-    """Yield the child processes of a process, zombies included.
+    """Yield the ids of a process's children, including zombies.
 
-    Reads the kernel's lists of children if they exist, since a machine may have thousands of processes.
+    Reads the kernel's child lists if they exist, because a machine may have thousands of processes.
     """
     lists = list(Path(f"/proc/{pid}/task").glob("*/children"))
     for file in lists:
@@ -162,7 +162,7 @@ def children_of(pid: int) -> Iterator[int]:
 
 
 def has_ended(pid: int) -> bool:
-    """True for a zombie and an unknown id."""
+    """True for a zombie or an unknown id."""
     try:
         return bool(psutil.Process(pid).status() == psutil.STATUS_ZOMBIE)
     except psutil.NoSuchProcess:
@@ -170,7 +170,7 @@ def has_ended(pid: int) -> bool:
 
 
 SHARED_MEMORY = Path("/dev/shm")
-# Beginning of the names of the Python backend's regions. Newer Tritons let no client map a region with this name.
+# Prefix of the names of the Python backend's regions. Newer Tritons let no client map a region with this name.
 REGION_PREFIX = "triton_python_backend_shm_region_rfm"
 NEEDS_ROOM = "free some (a container has more of /dev/shm with --shm-size)"
 _LOCK = "lock"
@@ -179,8 +179,8 @@ _LOCK = "lock"
 class Claim:
     """A server's shared memory: the Python backend's regions, and a folder for ``Installation``.
 
-    This process and its children hold a lock through ``lock_file``, which ends with the last of them. A process id
-    would prove nothing, because containers with process ids of their own may share the memory.
+    This process and its children hold a lock through ``lock_file`` until the last of them ends. A process id would
+    prove nothing: containers with their own process ids may share the memory.
     """
 
     def __init__(self) -> None:
@@ -193,7 +193,7 @@ class Claim:
         try:
             self.lock_file = os.open(new_lock, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600)
             fcntl.flock(self.lock_file, fcntl.LOCK_EX)
-            new_lock.rename(self._lock)  # renamed once locked, so that ``clear`` never finds it unlocked
+            new_lock.rename(self._lock)  # renamed once locked, so that ``clear_shared_memory`` never finds it unlocked
             self.backends.mkdir(0o700)
         except OSError as error:
             raise ServerStartError.at(
@@ -207,7 +207,7 @@ class Claim:
 
 
 def clear_shared_memory() -> list[Path]:
-    """Remove the shared memory of servers without a living process. Return the removed paths."""
+    """Remove shared memory that no living server holds. Return the removed paths."""
     locks = [lock for lock in SHARED_MEMORY.glob(f"{REGION_PREFIX}_*_{_LOCK}") if _is_free(lock)]
     return [path for lock in locks for path in _remove(lock)]
 

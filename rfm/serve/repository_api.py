@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The model-repository API of a running server: index, load, unload, and a probe of a version.
+"""The model-repository API of a running server: index, load, unload, and a probe of one version.
 
-Uses gRPC, since a load over HTTP blocks all connections of Triton's HTTP thread until the model is loaded.
+Uses gRPC, because a load over HTTP blocks all connections of Triton's HTTP thread until the model is loaded.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from rfm_client.contract.checks import require
 from rfm_client.contract.errors import LocatedError, ServerUnavailableError
 from rfm_client.contract.wire import PROBE_PREFIX, Tensors
 
-INDEX_PATH = "/v2/repository/index"  # over HTTP
+INDEX_PATH = "/v2/repository/index"  # for HTTP
 READY, LOADING, UNLOADING = "READY", "LOADING", "UNLOADING"
 POLL_S = 0.1
-ANSWER_S = 1800.0  # for a request; a load answers after the warm-up
+ANSWER_S = 1800.0  # for a request; a load returns only after the warm-up
 FINISH_S = 600.0  # for requests in flight on an old version
 _CHANNEL = [
-    ("grpc.min_reconnect_backoff_ms", 10_000),  # also bounds the time to connect
+    ("grpc.min_reconnect_backoff_ms", 10_000),  # also limits the time to connect
     ("grpc.enable_http_proxy", 0),
 ]
 _OF_SERVER = (*triton.UNAVAILABLE, *triton.OUT_OF_TIME, *triton.CANCELLED)
@@ -39,7 +39,7 @@ _UNAVAILABLE, _UNLOADED = "UNAVAILABLE", "unloaded"
 
 
 class RepositoryApiError(LocatedError):
-    """A failed request of the repository API, with the reason."""
+    """A failed repository API request, with the reason."""
 
     @property
     def is_refusal(self) -> bool:
@@ -64,14 +64,14 @@ class ModelVersion:
 
     @property
     def is_unloaded(self) -> bool:
-        """True if it was unloaded on request or never loaded; False if it failed to load."""
+        """True if the version was unloaded on request or never loaded; False if it failed to load."""
         return self.state == _NOT_LOADED or (self.state, self.reason) == (_UNAVAILABLE, _UNLOADED)
 
 
 class RepositoryApi:
-    """The server at ``url``: grpc://host:port, or grpcs:// with TLS. A context manager.
+    """Client for the server at ``url``: grpc://host:port, or grpcs:// with TLS. A context manager.
 
-    options: for tritonclient's gRPC client, such as the options of Credentials
+    options: for tritonclient's gRPC client, such as those from Credentials
 
     The constructor raises InvalidValueError for an unusable URL, the methods raise RepositoryApiError.
     """
@@ -97,15 +97,15 @@ class RepositoryApi:
         return [entry.version for entry in ready if entry.version is not None]
 
     def load(self, model: str) -> None:
-        """Load the versions in the model's configuration. If a load fails, the served versions stay."""
+        """Load the versions in the model's configuration. If the load fails, the served versions stay."""
         self._request(self._client.load_model, model)
 
     def unload(self, model: str) -> None:
-        """Unload the model after its requests in flight."""
+        """Unload the model once its requests in flight are done."""
         self._request(self._client.unload_model, model)
 
     def wait_gone(self, model: str, kept: Collection[int] = ()) -> None:
-        """Wait until every version of the model, except ``kept``, is unloaded."""
+        """Wait until every version of the model is unloaded, except ``kept``."""
         deadline_s = time.monotonic() + FINISH_S
         while time.monotonic() < deadline_s:
             going = [entry for entry in self.index() if entry.name == model and entry.state in _GOING]
@@ -115,7 +115,7 @@ class RepositoryApi:
         raise RepositoryApiError.at(model, f"its old versions to finish within {FINISH_S:g} s", "no end")
 
     def infer(self, model: str, version: int, inputs: Tensors, outputs: Collection[str]) -> Tensors:
-        """Return the outputs of a version for a probe, whose request id distinguishes it from callers' requests."""
+        """Return a version's outputs for a probe. The request id distinguishes probes from callers' requests."""
         tensors = []
         for name, array in inputs.items():
             tensors.append(tritonclient.grpc.InferInput(name, array.shape, np_to_triton_dtype(array.dtype)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The status port of ``rfm serve``: live, ready, and metrics of its restarts."""
+"""The status port of ``rfm serve``: live, ready, and metrics about restarts."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, G
 
 from rfm_client.contract.addresses import ListenAddress
 
-NO_REASON = ""  # of a ready model
-REQUEST_S = 5.0  # longest silence of a connection
+NO_REASON = ""  # for a ready model
+REQUEST_S = 5.0  # a connection may be silent this long
 
 
 class Status:
-    """Ready models, and the reasons why others are not."""
+    """Which models are ready, and why the others are not."""
 
     def __init__(self) -> None:
         self._reasons: Mapping[str, str] = {}
@@ -34,7 +34,7 @@ class Status:
         self.restarts = Counter("rfm_serve_restarts", told, ["what"], registry=self._registry)
 
     def record(self, reasons: Mapping[str, str]) -> None:
-        """Record the state of all models. reasons: why each model is not ready, or NO_REASON"""
+        """Record every model's state. reasons: why each model is not ready, or NO_REASON"""
         gone, before, self._reasons = self._reasons.keys() - reasons.keys(), self._reasons, dict(reasons)
         for model, reason in before.items():
             if reason not in (NO_REASON, reasons.get(model)):
@@ -47,7 +47,7 @@ class Status:
             self._ready.remove(model)
 
     def record_down(self, reason: str) -> None:
-        """Record a reason why no model is ready."""
+        """Record why no model is ready."""
         self.record(dict.fromkeys(self._reasons, reason))
 
     @property
@@ -59,14 +59,14 @@ class Status:
         return is_ready, {"ready": is_ready, "models": models}
 
     def metrics(self) -> bytes:
-        """Return the metrics in the text format of Prometheus."""
+        """Return the metrics in Prometheus text format."""
         return generate_latest(self._registry)
 
 
 class StatusServer(ThreadingHTTPServer):
     """HTTP server with ``/live``, ``/ready`` and ``/metrics``.
 
-    Raises ServerStartError for a taken port.
+    Raises ServerStartError if the port is taken.
     """
 
     daemon_threads = True
@@ -84,7 +84,7 @@ class StatusServer(ThreadingHTTPServer):
         self.server_close()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Log no error of a caller who left before the answer."""
+        """Log no error if a caller left before the response."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)
 

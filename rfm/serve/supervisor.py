@@ -20,11 +20,11 @@ from rfm.serve.triton_server import POLL_S, Config, SpoiltStartError, TritonServ
 from rfm.serve.watch import TRITON, TritonWatch
 
 GATEWAY = "gateway"
-STEADY_S = 60.0  # after a longer run, a process is not in a crash loop
+STEADY_S = 60.0  # a process that ran longer is not in a crash loop
 MOST = 5  # restarts in a row; a call ends a process twice at most
-ASK_S = 1.0  # between the requests to the gateway
-TRIES = 2  # requests in a row without an answer; one alone may be due to a machine that stood still
-GATEWAY_PAUSE_S = 5.0  # between its starts
+ASK_S = 1.0  # between requests to the gateway
+TRIES = 2  # unanswered requests in a row; a single one may mean that the machine stood still
+GATEWAY_PAUSE_S = 5.0  # between gateway starts
 logger = logging.getLogger(__name__)
 
 
@@ -33,7 +33,7 @@ class CrashLoopError(ServerStartError):
 
 
 class FaultCount:
-    """Counts faults of Triton in a row. A fault after a run of ``steady_s`` is the first of a new row."""
+    """Counts Triton's consecutive faults. A fault after a run of ``steady_s`` starts a new count."""
 
     def __init__(self, steady_s: float = STEADY_S) -> None:
         self._steady_s = steady_s
@@ -45,7 +45,7 @@ class FaultCount:
         self._running_since_s = time.monotonic()
 
     def failed(self, reason: str) -> None:
-        """Record a fault or a failed start. Raises CrashLoopError after more than MOST."""
+        """Record a fault or a failed start. Raises CrashLoopError after more than MOST in a row."""
         if self._running_since_s is not None and time.monotonic() - self._running_since_s >= self._steady_s:
             self._num_faults = 0
         self._running_since_s = None  # a failed start does not count as running
@@ -56,13 +56,13 @@ class FaultCount:
 
 
 class GatewayProcess:
-    """The gateway as a child process. Call ``look`` often: it restarts a gateway that has ended, however often it ends.
+    """The gateway as a child process. Call ``look`` often: it restarts an ended gateway without limit.
 
     A thread kills a gateway that listens but is silent.
 
-    command: command line of the gateway
-    address: host and port of the gateway
-    silent_s: seconds without an answer after which the gateway counts as silent
+    command: the gateway's command line
+    address: the gateway's host and port
+    silent_s: a gateway without an answer for this long counts as silent
     """
 
     def __init__(self, command: Sequence[str], address: tuple[str, int], silent_s: float) -> None:
@@ -94,13 +94,13 @@ class GatewayProcess:
             time.sleep(ASK_S)
 
     def _ask(self) -> None:
-        """Wait for a sign of life: an answer, also without the key, or the end of a connection that demands TLS."""
+        """Wait for a sign of life: a response, even one that refuses, or the end of a connection that requires TLS."""
         with socket.create_connection(self._address, self._silent_s / TRIES) as connection:
             connection.sendall(b"HEAD / HTTP/1.0\r\n\r\n")
             connection.recv(1)
 
     def look(self) -> str | None:
-        """Restart an ended gateway, GATEWAY_PAUSE_S after its start or later. Return why it ended; None: no restart."""
+        """Restart an ended gateway, at least GATEWAY_PAUSE_S after its start. Return why it ended; None: no restart."""
         if self._group is None or (status := self._group.process.poll()) is None:
             return None
         if time.monotonic() - self._started_s < GATEWAY_PAUSE_S:
@@ -121,9 +121,9 @@ class Supervisor:
     """Serves until a stop signal. For the main thread.
 
     gateway: a gateway beside the server; None: no gateway
-    status_port: port of the status server, on Triton's host; None: no status server
+    status_port: port for the status server, on Triton's host; None: no status server
     probe_s, hang_s, triton_silent_s: see TritonWatch
-    tell_ready: tells the user that all models are ready for the first time; None: a line in the log
+    tell_ready: called once when all models are ready for the first time; None: log a line instead
     """
 
     server: TritonServer
@@ -216,7 +216,7 @@ class Supervisor:
     def _start_again(self, what: str, why: str, *, counts: bool = True) -> None:
         """Restart Triton; return when it is ready, or after a stop signal. Raises CrashLoopError.
 
-        what: the model with the fault, or TRITON
+        what: the model at fault, or TRITON
         counts: False: the fault is not part of a crash loop
         """
         began_s = time.monotonic()
@@ -236,7 +236,7 @@ class Supervisor:
                     logger.info("ready again after %.1f s", time.monotonic() - began_s)
                 return
             except ServerStartError as error:
-                # A crash of Triton itself is the fault of the model before; a kill from outside is not.
+                # The model from before is to blame if Triton itself crashes, but not if something outside kills Triton.
                 was_killed = self.server.exit_status == -signal.SIGKILL and not isinstance(error, SpoiltStartError)
                 what, why = error.model or (TRITON if was_killed else what), str(error)
 

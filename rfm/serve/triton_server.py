@@ -39,8 +39,8 @@ from rfm.serve.processes import (
 from rfm.serve.repository import CONFIG_FILE, check_models, models_in, no_models
 from rfm.serve.repository_api import INDEX_PATH, versions_of
 
-MAX_HTTP_BYTES = 256 * 2**20  # of a request's body; gRPC takes 2 GiB
-# Also refused, besides the options that rfm serve sets: their aliases, and options that break a start.
+MAX_HTTP_BYTES = 256 * 2**20  # for a request body; gRPC accepts 2 GiB
+# Refused besides the options that rfm serve sets: their aliases, and options that break a start.
 _KEPT = {
     "--model-store",
     "--backend-directory",
@@ -63,7 +63,7 @@ _ARGUMENT = re.compile(r"(--[a-z][a-z0-9-]+)=.*")
 
 
 def check_arguments(more: Sequence[str], own: Sequence[str]) -> None:
-    """Raise ServerStartError for an option of ``own``, also abbreviated, and for anything but ``--option=value``."""
+    """Raise ServerStartError for anything but ``--option=value``, and for options in ``own``, even abbreviated."""
     kept = {argument.partition("=")[0] for argument in own} - _REPEATED | _KEPT
     for argument in more:
         match = _ARGUMENT.fullmatch(argument)
@@ -74,18 +74,18 @@ def check_arguments(more: Sequence[str], own: Sequence[str]) -> None:
 
 
 def size_limits(installation: Installation, given: Sequence[str]) -> list[str]:
-    """Return the option that limits a request's size; empty if ``given`` has it, or tritonserver (2.51) lacks it."""
+    """Return the option that limits request size; empty if ``given`` has it, or tritonserver (2.51) lacks it."""
     if any(argument.startswith(f"--{_SIZE_OPTION}=") for argument in given):
         return []
     return [f"--{_SIZE_OPTION}={MAX_HTTP_BYTES}"] if _knows(installation.executable, _SIZE_OPTION) else []
 
 
 def _knows(program: Path, option: str) -> bool:
-    """True if the program file contains the option's name. ``--help`` would start Triton."""
+    """True if the program file contains the option's name. Running ``--help`` would start Triton."""
     try:
         with program.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             return content.find(option.encode()) >= 0
-    except (OSError, ValueError):  # unreadable or empty: the start gives the reason
+    except (OSError, ValueError):  # unreadable or empty: the start reports the reason
         return False
 
 
@@ -94,7 +94,7 @@ LOAD_S = 1800.0
 ANSWER_TIMEOUT_S = 10.0  # while the server starts
 NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # else a version's folder changes, and a `load` reloads all versions
 SECRET = re.compile("RFM_.*_KEY")  # variables withheld from Triton and the model processes
-_REMEDIES = {  # by a pattern of the reason why a model is not loaded
+_REMEDIES = {  # by pattern in the reason why a model is not loaded
     "unsupported gpu id|KIND_GPU|compiled with CUDA|no NVIDIA driver": (
         "the models were exported for GPUs that this machine lacks: rfm export again here (--num-gpus 0: for the CPU)"
     ),
@@ -106,7 +106,7 @@ Config = Mapping[str, Any]  # a model's configuration in Triton's JSON
 
 
 def short_spin(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return variables that limit spinning of OpenMP's threads to 0.1 ms; empty if the environment sets a limit.
+    """Return variables that limit OpenMP spinning to 0.1 ms; empty if the environment sets a limit.
 
     On a busy machine, libgomp's default of 3 ms makes a forward pass several times slower. On a quiet machine, no
     spinning makes it 1.5 times slower.
@@ -123,16 +123,16 @@ class SpoiltStartError(ServerStartError):
 
 @dataclass(eq=False)
 class TritonServer:
-    """A tritonserver with all models of ``repository``. The context manager starts and stops it.
+    """A tritonserver with all models in ``repository``. The context manager starts and stops it.
 
-    It ends with this process, whatever ends that.
+    The server ends with this process, however this process ends.
 
     http_threads: threads that read HTTP requests; None: Triton's choice
-    hang_s: seconds without progress of a batch after which a model process ends itself
+    hang_s: a model process ends itself after a batch makes no progress for this long
     log: file for Triton's log; None: warnings and errors go to this process's standard error
-    admin_key: key of the restricted APIs; default: a new random key
+    admin_key: key for the restricted APIs; default: a new random key
     accepts_known_vulnerabilities: True: listen on any address, even with a vulnerable Triton
-    more_arguments: further arguments of tritonserver, such as ``--trace-config=...``
+    more_arguments: further tritonserver arguments, such as ``--trace-config=...``
     """
 
     repository: Path
@@ -149,17 +149,17 @@ class TritonServer:
     def __post_init__(self) -> None:
         self._http = Http(self.endpoints.http_host, self.endpoints.http_port, http_headers(self.admin_key))
         self._claim: Claim | None = None
-        self._signal: int | None = None  # the last signal that was sent
+        self._signal: int | None = None  # the last signal sent
         self._group: ProcessGroup | None = None  # the newest
 
     @property
     def models(self) -> list[str]:
-        """Names of the models in the repository."""
+        """Model names in the repository."""
         return models_in(self.repository)
 
     @property
     def pid(self) -> int:
-        """Id of the newest process."""
+        """Process id of the newest tritonserver."""
         assert self._group is not None  # started
         return self._group.process.pid
 
@@ -183,8 +183,8 @@ class TritonServer:
     def start_ready(self, served: Mapping[str, Config] | None = None) -> None:
         """Start the process and wait until every model is ready. Repeat a spoilt start once, unless it is a restart.
 
-        served: in a restart, configurations of the models to serve, which may name other versions than their files do;
-            None: all models, as in their files
+        served: for a restart, configurations of the models to serve, which may name other versions than the model files
+            do; None: all models, as in their files
 
         Raises ServerStartError.
         """
@@ -221,10 +221,10 @@ class TritonServer:
         self.stop()
 
     def _start_ready(self, served: Mapping[str, Config] | None) -> None:
-        """Start Triton with ``served``, or with all models if it is None, and wait until they are ready.
+        """Start Triton with ``served``, or with all models if None, and wait until they are ready.
 
-        Triton starts with the models if their files name the versions in ``served``. If any file names others, Triton
-        starts without models, and then loads each with its configuration in ``served``.
+        If every model's file names the versions in ``served``, Triton starts with the models. Otherwise Triton starts
+        without models, and then loads each with its configuration in ``served``.
         """
         there = self.models
         if not there:
@@ -276,7 +276,7 @@ class TritonServer:
             self._group.process.send_signal(self._signal)
 
     def _wait_ready(self, models: Collection[str]) -> None:
-        """Wait until ``models`` are ready. Raises ServerStartError with the reasons of the models that failed."""
+        """Wait until ``models`` are ready. Raises ServerStartError with the reason for each failed model."""
         processes, ends_s = ModelProcesses(self.pid), time.monotonic() + LOAD_S
         while (status := self.exit_status) is None:
             try:
@@ -295,7 +295,7 @@ class TritonServer:
         raise kind(f"tritonserver: expected to run, got {how_it_ended(status)}")
 
     def _load(self, name: str, config: Config) -> None:
-        """Load a model with this configuration, over HTTP, since the gRPC port may demand a certificate."""
+        """Load a model with this configuration, over HTTP: the gRPC port may require a certificate."""
         body = json.dumps({"parameters": {"config": json.dumps(config)}}).encode()
         path = f"/v2/repository/models/{quote(name, safe='')}/load"
         processes, ends_s = ModelProcesses(self.pid), time.monotonic() + LOAD_S
@@ -328,7 +328,7 @@ class TritonServer:
             *(f"--load-model={model}" for model in models),
             "--disable-auto-complete-config",
             "--strict-readiness=false",  # else a failed version makes the whole server not ready
-            "--exit-on-error=false",  # keeps the reason of each failed model readable
+            "--exit-on-error=false",  # keeps the reason for each failed model readable
             f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
             *self.endpoints.arguments(),
             *([f"--http-thread-count={self.http_threads}"] if self.http_threads else []),
@@ -355,7 +355,7 @@ def _names_the_same_versions(repository: Path, model: str, config: Config) -> bo
         file = text_format.Parse((repository / model / CONFIG_FILE).read_text(), ModelConfig())
     except (OSError, UnicodeDecodeError, text_format.ParseError):
         return False
-    if not file.version_policy.HasField("specific"):  # a model of another program
+    if not file.version_policy.HasField("specific"):  # another program's model
         return True
     return bool(list(file.version_policy.specific.versions) == config["version_policy"]["specific"]["versions"])
 
@@ -373,7 +373,7 @@ def stopped_by_signals() -> Iterator[None]:
 
 @contextmanager
 def temporary_server(repository: Path, log: Path, tritonserver: Path | None = None) -> Iterator[Endpoints]:
-    """Context manager with a server on free ports and its log in a file. Raises ServerStartError."""
+    """Context manager with a server on free ports that logs to a file. Raises ServerStartError."""
     log.parent.mkdir(parents=True, exist_ok=True)
     installation = find_installation(tritonserver)
     with (

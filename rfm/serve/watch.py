@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Watch a running Triton: its served models, their readiness, and its faults.
+"""Watch a running Triton: its served models, their readiness, and faults.
 
 | fault | found by |
 |---|---|
-| Triton is silent | no answer of ``/metrics`` |
-| a model process is dead or stopped, also while its model loads | ``ModelProcesses`` |
-| a model hangs outside of a batch, or its requests fail before they reach model.py | its ``probe`` |
+| Triton is silent | ``/metrics`` does not respond |
+| a model process is dead or stopped, also during a load | ``ModelProcesses`` |
+| a model hangs outside a batch, or its requests fail before they reach model.py | ``Probe`` |
 
 A process with a hung batch or a broken device ends itself (``rfm.triton_model.watchdog``).
 """
@@ -30,10 +30,10 @@ from rfm.serve.triton_server import Config, TritonServer
 from rfm_client.contract.description import num_instances
 
 LOOK_S = 0.5
-LOOKS = 3  # a restart needs at least so many looks without an answer
+LOOKS = 3  # a restart needs at least LOOKS failed probes
 _TIMEOUT_S = 1.5
 _INDEX_TIMEOUT_S = 5.0
-_PROGRESS = re.compile(  # counts that grow with a model's progress
+_PROGRESS = re.compile(  # counters that grow while a model makes progress
     r'^(?:nv_inference_request_success|rfm_forward_passes_total)\{[^}]*\bmodel="(?P<model>[^"]+)".*\} (?P<count>\S+)$',
     re.MULTILINE,
 )
@@ -44,9 +44,9 @@ logger = logging.getLogger(__name__)
 class TritonWatch:
     """Looks at Triton every LOOK_S in its own thread, until ``close``.
 
-    probe_s: seconds between the probes of a model
-    hang_s: seconds without an answer after which a model counts as hung
-    silent_s: seconds without an answer after which Triton counts as silent
+    probe_s: seconds between a model's probes
+    hang_s: a model without a response for this long counts as hung
+    silent_s: a Triton without a response for this long counts as silent
     served: configurations of the models to serve; the watch adds those it finds
     """
 
@@ -69,20 +69,20 @@ class TritonWatch:
         self._processes = ModelProcesses(server.pid)
         self._probes: dict[str, Probe] = {}
         self._counts: dict[str, float] = {}
-        self._progress_s: dict[str, float] = {}  # time of a model's last progress
+        self._progress_s: dict[str, float] = {}  # when a model last made progress
         self._ready: dict[str, list[int]] = {}  # ready versions by model
         self._going: set[str] = set()  # models that are loading or unloading
-        self._wanted: dict[str, int] = {}  # processes by model; without the models that are loading
+        self._wanted: dict[str, int] = {}  # process count by model; excludes models that are loading
         self._leaving: set[str] = set()
         self.served = dict(served)
         self.reasons: dict[str, str] = dict.fromkeys(served, "it is loading")
         self.fault: tuple[str, str] | None = None  # the model, or TRITON, and the reason
-        self.is_of_load = False  # True: the fault is that of a load, which somebody asked for
+        self.is_of_load = False  # True: the fault is in a load, which somebody asked for
         self._closed = threading.Event()
         threading.Thread(target=self._run, name="rfm-watch", daemon=True).start()
 
     def close(self) -> None:
-        """End the looks and the probes."""
+        """Stop the looks and the probes."""
         self._closed.set()
 
     def _run(self) -> None:
@@ -134,7 +134,7 @@ class TritonWatch:
 
     def _keep_up(self) -> None:
         """Read Triton's index. Raises NO_ANSWER."""
-        timeout_s = min(_INDEX_TIMEOUT_S, self._silent_s / LOOKS)  # a silent Triton is no hung model
+        timeout_s = min(_INDEX_TIMEOUT_S, self._silent_s / LOOKS)  # a silent Triton must not look like a hung model
         versions = versions_of(self._http.json(INDEX_PATH, timeout_s, "POST"))
         ready = {entry.name: list[int]() for entry in versions}
         for entry in versions:
@@ -153,7 +153,7 @@ class TritonWatch:
         self.reasons = {name: self._reason(name, versions) for name in self.served}
 
     def _keep_up_with(self, model: str, ready: list[int]) -> None:
-        """Note the configuration and probe a model whose ready versions are others than before."""
+        """If a model's ready versions have changed, record its configuration and probe it."""
         if not ready:
             self._forget(model)
         elif model not in self._going and ready != self._ready.get(model):
@@ -175,7 +175,7 @@ class TritonWatch:
             self._probes.pop(model).close()
 
     def _reason(self, model: str, versions: Collection[ModelVersion]) -> str:
-        """Return the reason why the model is not ready, or NO_REASON."""
+        """Return why the model is not ready, or NO_REASON."""
         if model not in self._ready:
             told = [entry.reason for entry in versions if entry.name == model and entry.reason]
             return next(iter(told), "it is not loaded")
@@ -187,10 +187,10 @@ class TritonWatch:
 
 
 def parts_of(config: Config) -> list[str]:
-    """Return the models of an ensemble; empty for other models."""
+    """Return the models in an ensemble; empty for other models."""
     return [step["model_name"] for step in config.get("ensemble_scheduling", {}).get("step", [])]
 
 
 def serving_just(config: Config, versions: Sequence[int]) -> Config:
-    """Return a model's configuration for these versions only."""
+    """Return a model's configuration, restricted to these versions."""
     return {**config, "version_policy": {"specific": {"versions": list(versions)}}}

@@ -30,7 +30,7 @@ from rfm_client.contract.process import about, write_log
 from rfm_client.contract.samples import EncoderSample
 from rfm_client.contract.wire import Tensors
 
-ASKING_S = 0.01  # of the last batch, for each request that is asked for in vain; asking takes 0.1 ms
+ASKING_S = 0.01  # of the last batch's time, per fruitless cancellation check; a check takes 0.1 ms
 
 logger = logging.getLogger(__name__)
 
@@ -40,18 +40,19 @@ Scored: TypeAlias = list[tuple[Sequence[Request[Question]], Execution]]  # reque
 
 
 class BatchModel(Generic[Question, Answer]):
-    """Adapter between Triton and a function from questions to answers. A question is a sample, or an
-    encoder's sample; a request holds one or more.
+    """Adapter between Triton and a function from questions to answers.
 
-    A subclass reads the tensors of a request (``decode``), checks and prepares each question (``prepare``), answers
-    questions (``answer``), and writes the answers of a request (``encode``).
+    A question is a sample or an encoder's sample; a request holds one or more.
+
+    A subclass reads a request's tensors (``decode``), checks and prepares each question (``prepare``), answers
+    questions (``answer``), and writes a request's answers (``encode``).
 
     A subclass that ``works_ahead`` scores in a ``Pipeline``, which calls ``work_ahead`` before a question's turn.
     Others score in ``execute``.
     """
 
     def initialize(self, args: Mapping[str, str]) -> None:
-        """Called once by Triton when the model is loaded."""
+        """Load the model. Triton calls this once."""
         close_to_other_users()  # before any frames
         write_log(f"{args['model_name']}/{args['model_version']}", os.environ)
         config = json.loads(args["model_config"])
@@ -87,7 +88,7 @@ class BatchModel(Generic[Question, Answer]):
             placement.apply()
 
     def finalize(self) -> None:
-        """Called once by Triton when the model is unloaded."""
+        """Clean up. Triton calls this once when it unloads the model."""
         if self._pipeline is not None:
             self._pipeline.close()
         self._metrics.close()
@@ -103,11 +104,11 @@ class BatchModel(Generic[Question, Answer]):
         return False
 
     def decode(self, tensors: Tensors) -> list[Question]:
-        """Return the questions of a request. Raises InvalidSampleError."""
+        """Return the questions in a request. Raises InvalidSampleError."""
         raise NotImplementedError
 
     def prepare(self, question: Question) -> tuple[Any, int]:
-        """Return the input of ``answer`` for a question, and its number of tokens (see ``token_budget``). Must be fast.
+        """Return a question's input for ``answer``, and its token count (see ``token_budget``). Must be fast.
 
         Raises RewardError if the question cannot be answered.
         """
@@ -117,11 +118,11 @@ class BatchModel(Generic[Question, Answer]):
         """Do the slow part of a prepared question before its turn. Called in any thread, or never."""
 
     def answer(self, questions: Sequence[Any], execution: Execution) -> Sequence[Answer | RewardError]:
-        """Return an answer or an error for each prepared question. ``execution`` records their cost."""
+        """Return an answer or an error for each prepared question. ``execution`` records the cost."""
         raise NotImplementedError
 
     def encode(self, answers: Sequence[Answer], tensors: Tensors, outputs: Collection[str]) -> Tensors:
-        """Return the output tensors of a request. tensors: its inputs; outputs: names of the requested outputs"""
+        """Return a request's output tensors. tensors: the inputs; outputs: names of the requested outputs"""
         raise NotImplementedError
 
     def execute(self, requests: Sequence[Any]) -> list[Any] | None:
@@ -130,7 +131,7 @@ class BatchModel(Generic[Question, Answer]):
         pipeline = self._pipeline
         if pipeline is None:
             return self._responses(batch, self._score)
-        if len(batch) == 1 and pipeline.is_idle:  # without the queue and the copies
+        if len(batch) == 1 and pipeline.is_idle:  # skips the queue and the copies
             return self._responses(batch, pipeline.run)
         for request, inference in zip(batch, requests, strict=True):
             request.outlive(inference)
@@ -178,13 +179,13 @@ class BatchModel(Generic[Question, Answer]):
             request.fail(error)
 
     def _work_ahead(self, request: Request[Question]) -> None:
-        """Do the slow part of a request while others are scored. Errors are dropped: scoring raises them again."""
+        """Do a request's slow part while others are scored. Drops errors: scoring raises them again."""
         with suppress(Exception):
             for prepared in request.prepared:
                 self.work_ahead(prepared)
 
     def _score(self, batch: list[Request[Question]]) -> Scored[Question]:
-        """Set the answers or the error of each request. Return the cost of scoring them."""
+        """Set each request's answers or error. Return the cost of scoring."""
         self._drop_cancelled(batch)
         failed = [request for request in batch if request.error is not None]
         good = [request for request in batch if request.error is None]
@@ -197,9 +198,9 @@ class BatchModel(Generic[Question, Answer]):
         return scored
 
     def _drop_cancelled(self, batch: list[Request[Question]]) -> None:
-        """Set the error of requests whose callers have left: Triton 2.51 hands them over too.
+        """Set an error on requests whose callers have left: Triton 2.51 hands those over too.
 
-        The oldest come first. Asking in vain takes at most 1 % of the last batch's time.
+        Checks the oldest requests first. Fruitless checks take at most 1 % of the last batch's time.
         """
         num_in_vain = int(self._batch_s / ASKING_S)
         for request in batch:
@@ -211,7 +212,7 @@ class BatchModel(Generic[Question, Answer]):
                 num_in_vain -= 1
 
     def _scored(self, batch: list[Request[Question]]) -> Scored[Question]:
-        """Score the requests together or, if that fails, each alone, so that only the cause fails."""
+        """Score the requests together or, if that fails, each alone, so that only the culprit fails."""
         self._watchdog.step()
         execution = Execution(on_forward=self._watchdog.step)
         try:
@@ -249,7 +250,7 @@ class BatchModel(Generic[Question, Answer]):
             _tell(self._metrics.add, part, execution)
 
     def _score_blank(self) -> None:
-        """Score the sample of ``probe_request``. Raises errors of a broken device, not those of a refused sample."""
+        """Score the sample from ``probe_request``. Raises errors from a broken device, but ignores a refused sample."""
         try:
             questions = [self.prepare(question)[0] for question in self.decode(self._blank_tensors)]
         except InvalidSampleError:  # a checkpoint may refuse blank frames
@@ -258,7 +259,7 @@ class BatchModel(Generic[Question, Answer]):
 
 
 def _tell(tell: Callable[..., None], *what: Any) -> None:
-    """Call a function that logs or counts. Log its errors, since requests need their answers all the same."""
+    """Call a function that logs or counts. Log errors instead of raising: responses must still go out."""
     try:
         tell(*what)
     except Exception:
@@ -266,19 +267,19 @@ def _tell(tell: Callable[..., None], *what: Any) -> None:
 
 
 def _log_split(batch: Sequence[Request[Any]], error: Exception) -> None:
-    """Log requests that failed in a batch, before each is scored alone."""
+    """Log a failed batch, before its requests are scored one by one."""
     with about([request.request_id for request in batch]):
         logger.error("the batch failed, now each request is scored alone", exc_info=error)
 
 
 def _first_error(answers: Sequence[Any]) -> RewardError | None:
-    """Return the first error of a request, with the index of its question if there are several."""
+    """Return a request's first error, with the index of the question if there are several."""
     errors = ((answer, index) for index, answer in enumerate(answers) if isinstance(answer, RewardError))
     return next((_located(*error, len(answers)) for error in errors), None)
 
 
 def _located(error: RewardError, index: int, count: int) -> RewardError:
-    """Return an error with the index of its question, if the request has several."""
+    """Return an error with its question's index, if the request has several."""
     return error.inside(f"samples[{index}]") if isinstance(error, InvalidSampleError) and count > 1 else error
 
 
@@ -289,6 +290,6 @@ def _sample_types(input_names: Sequence[str]) -> list[str]:
 
 
 def _checkpoint(description: Description) -> dict[str, str]:
-    """Return labels of the served checkpoint: source, revision, digest, and the class of its network."""
+    """Return labels for the served checkpoint: source, revision, digest, and network class."""
     origin = {name: getattr(description, name) or "" for name in ("source", "revision", "weights_digest")}
     return {**origin, "network": description.network.get("class", "")}

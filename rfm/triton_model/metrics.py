@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The ``rfm_*`` metrics of a model instance, on Triton's metrics endpoint.
 
-An update is a call to Triton's process and takes some 20 us. Requests therefore only add to sums, and a thread reports
-the sums every FLUSH_INTERVAL_S.
+An update calls Triton's process and takes about 20 us. Requests therefore only add to sums; a thread reports the sums
+every FLUSH_INTERVAL_S.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ BATCH_SAMPLES, BATCH_PADDING = "batch_samples", "batch_padding_ratio"
 COLLATE_SECONDS, FORWARD_SECONDS = "collate_seconds", "forward_seconds"
 ENCODED, FOUND, MISSED = "frames_encoded_total", "feature_cache_hits_total", "feature_cache_misses_total"
 UNCLEAR, UNREADABLE = "unclear_answers_total", "unreadable_answers_total"
-PASSES = "forward_passes_total"  # shows progress, by which ``rfm serve`` tells a long batch from a hang
+PASSES = "forward_passes_total"  # shows progress, so that ``rfm serve`` can distinguish a long batch from a hang
 
 _TOTALS = {
     FRAMES: "Frames scored.",
@@ -51,12 +51,12 @@ _HISTOGRAMS = {
 
 
 class InstanceMetrics:
-    """Metrics of an instance. Must be closed. Their first error is logged; no error fails a request.
+    """Metrics of an instance. Must be closed. Only the first error is logged; no error fails a request.
 
     labels: labels of the instance
-    checkpoint: labels of rfm_checkpoint_info
+    checkpoint: labels for rfm_checkpoint_info
     sample_types: sample types that the model scores
-    num_steps: returns the number of forward passes so far
+    num_steps: returns how many forward passes have run so far
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class InstanceMetrics:
         num_steps: Callable[[], int],
     ) -> None:
         self._num_steps, self._num_told_steps = num_steps, num_steps()
-        self._lock = threading.Lock()  # of the sums below
+        self._lock = threading.Lock()  # guards the sums below
         self._samples: Counter[tuple[str, str]] = Counter()
         self._totals: Counter[str] = Counter()
         self._observed: list[tuple[str, float]] = []
@@ -111,7 +111,7 @@ class InstanceMetrics:
                 ]
 
     def close(self) -> None:
-        """Report the last sums, and the end of the checkpoint's service."""
+        """Report the last sums, and that the checkpoint is no longer served."""
         if self._thread is not None:
             self._closing.set()
             self._thread.join()
@@ -120,8 +120,8 @@ class InstanceMetrics:
     def _make_all(self, labels: dict[str, str], checkpoint: Mapping[str, str], sample_types: Collection[str]) -> None:
         """Create the metrics in Triton's process, where they outlive this process and continue after a reload.
 
-        No family is ever destroyed, nor the metrics that it holds: after ``finalize`` that would crash this process,
-        and earlier it would remove the series under an instance that was loaded in this one's place.
+        Never destroy a metric or its family: after ``finalize`` that would crash this process, and earlier it would
+        remove the series under an instance that was loaded to replace this one.
         """
         samples = self._family("samples_total", "COUNTER", "Samples, by the outcome of their request.")
         self._sample_metrics = {  # all at once, so that the first failure is an increase
@@ -156,7 +156,7 @@ class InstanceMetrics:
             self._flush(is_served=True)
 
     def _flush(self, *, is_served: bool) -> None:
-        """Report the sums since the last call."""
+        """Report what has accumulated since the last call."""
         with self._lock:
             samples, self._samples = self._samples, Counter()
             totals, self._totals = self._totals, Counter()
@@ -177,7 +177,7 @@ class InstanceMetrics:
 
     def _show(self, *, is_served: bool) -> None:
         self._kept_metric.set(self._kept_bytes)
-        # Set again each time: after a reload, the old instance sets 0 after the new instance has set 1.
+        # Set at every flush: after a reload, the old instance sets 0 after the new instance has set 1.
         self._checkpoint_metric.set(float(is_served))
 
     def _log_once(self) -> None:

@@ -2,7 +2,7 @@
 """A pipeline that prepares, scores and answers requests at the same time. Independent of Triton.
 
 For models whose samples take long to prepare: it prepares the next batch while the device scores. Other models score
-in ``execute``, which takes half of the CPU time for a request.
+in ``execute``, which takes half the CPU time per request.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from rfm.triton_model.watchdog import end
 
 
 class Pipeline:
-    """Scores prepared requests in their order, as soon as they are ready. Must be closed.
+    """Scores prepared requests in order, as soon as they are ready. Must be closed.
 
-    prepare: does the slow part of a request, in a preparing thread; its errors are ignored
-    score: scores a batch, always in the same thread, since libgomp keeps a team of threads for each computing thread
-    reply: sends the results of ``score``
-    max_samples, max_tokens: limits of a batch; a larger request is its own batch
+    prepare: does a request's slow part, in a preparing thread; errors are ignored
+    score: scores a batch, always in the same thread, because libgomp keeps a team of threads per computing thread
+    reply: sends the results from ``score``
+    max_samples, max_tokens: batch limits; a larger request is its own batch
 
-    An exception of ``score`` or ``reply`` ends the process.
+    An exception in ``score`` or ``reply`` ends the process.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Pipeline:
         self._max_samples, self._max_tokens = max_samples, max_tokens
         self._changed = threading.Condition()
         self._waiting: deque[tuple[Request[Any], Future[None]]] = deque()
-        self._call: Callable[[], None] | None = None  # work of ``run`` for the scoring thread
+        self._call: Callable[[], None] | None = None  # what ``run`` gives the scoring thread to do
         self._is_scoring = self._is_closed = False
         self._scored: SimpleQueue[Any] = SimpleQueue()  # None ends it
         self._preparing = ThreadPoolExecutor(placement.num_preparing, "rfm-prepare", partial(use_threads, 1))
@@ -58,7 +58,7 @@ class Pipeline:
 
     @property
     def is_idle(self) -> bool:
-        """True if no request waits or is scored."""
+        """True if no request waits or is being scored."""
         with self._changed:
             return not (self._is_scoring or self._waiting)
 
@@ -111,8 +111,8 @@ class Pipeline:
         self._scored.put(None)
 
     def _next_batch(self) -> list[Request[Any]]:
-        """Wait for the first request; return it with the next requests that are prepared and fit into its batch."""
-        self._waiting[0][1].exception()  # waits; ``score`` meets an error of preparing again
+        """Wait for the first request; return it with the next prepared requests that fit into the same batch."""
+        self._waiting[0][1].exception()  # waits; if preparing failed, ``score`` meets the same error
         with self._changed:
             batch = [self._waiting.popleft()[0]]
             num_samples, num_tokens = batch[0].num_samples, batch[0].num_tokens

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The start of a model process: its shared memory, its weights, and the device and CPU threads of its instance."""
+"""Start a model process: protect shared memory, check weights, choose the instance's device and CPU threads."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _REGION = re.compile(r"/dev/shm/[^/\s]+$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Placement:
-    """Device of the network, and number of PyTorch's CPU threads."""
+    """Device for the network, and PyTorch's CPU thread count."""
 
     device: torch.device
     num_threads: int
 
     @property
     def num_preparing(self) -> int:
-        """Number of requests that are prepared at the same time."""
+        """How many requests are prepared at the same time."""
         return num_preparing(self.device, self.num_threads)
 
     @classmethod
@@ -46,13 +46,13 @@ class Placement:
         return cls(device, num_threads)
 
     def apply(self) -> None:
-        """Apply the settings to the calling thread. Every computing thread must call it."""
+        """Apply the settings to the calling thread. Every computing thread must call this."""
         use_threads(self.num_threads)
         keep_float32()
         use(self.device)
 
     def run(self, work: Callable[[], None]) -> None:
-        """Do the work in a temporary thread, whose OpenMP threads end with it."""
+        """Do the work in a temporary thread, so that its OpenMP threads end with it."""
         use_threads(1)  # for the calling thread
         with ThreadPoolExecutor(1, "rfm-load") as thread:
             thread.submit(self.apply).result()
@@ -60,9 +60,9 @@ class Placement:
 
 
 def close_to_other_users() -> None:
-    """Give the shared memory of this process the mode 0600. Triton creates it with 0644, whatever the umask says."""
+    """Set this process's shared memory to mode 0600. Triton creates it with 0644, whatever the umask says."""
     for region in {*_REGION.findall(Path("/proc/self/maps").read_text())}:
-        with suppress(OSError):  # of another user
+        with suppress(OSError):  # another user's
             Path(region).chmod(0o600)
 
 
@@ -70,7 +70,7 @@ def check_digest(version: Path, expected: str | None) -> None:
     """Raise CheckpointError if the weights in the folder ``version`` changed after the export.
 
     expected: digest in the model's configuration; None: unknown. The configuration in the version folder takes
-        precedence, since the model's may belong to a newer version
+        precedence, because the model's may belong to a newer version
     """
     kept = version / "config.pbtxt"
     if is_there(kept):
@@ -82,7 +82,7 @@ def check_digest(version: Path, expected: str | None) -> None:
 
 
 def _digest_in(file: Path) -> str | None:
-    """Return the digest of the weights in an exported configuration; None: unknown."""
+    """Return the weights' digest from an exported configuration; None: unknown."""
     try:
         config = text_format.Parse(file.read_text(), pb.ModelConfig())
         return Description.parse(config.parameters[DESCRIPTION_PARAMETER].string_value).weights_digest

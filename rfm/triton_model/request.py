@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A request of Triton: its questions, and their answers or its error."""
+"""A Triton request: its questions, and their answers or the error."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SAMPLE_TYPES = {
     SimilaritySample: "similarity",
     EncoderSample: "encode",
 }
-UNKNOWN_TYPE = "unknown"  # sample type of a request that could not be decoded
+UNKNOWN_TYPE = "unknown"  # sample type for a request that could not be decoded
 
 
 class CancelledError(RewardError):
@@ -42,16 +42,16 @@ class CancelledError(RewardError):
 
 @dataclass(eq=False)
 class Request(Generic[Question]):
-    """A request of Triton, and its state.
+    """A Triton request and its state.
 
-    request_id: the client's id of the request; may be empty
+    request_id: the client's request id; may be empty
     outputs: names of the requested outputs
     is_cancelled: asks Triton if the client cancelled; takes 0.1 ms
     is_counted: False for warm-ups and probes, which metrics leave out
     sender: Triton's response sender; None: ``execute`` returns the response
-    num_tokens: tokens of all samples; 0 before they are prepared
+    num_tokens: total token count; 0 before the samples are prepared
     questions, prepared, answers: of equal length, or still empty
-    error: reason for a missing answer; None: answered, or not yet scored
+    error: why there is no answer; None: answered, or not yet scored
     """
 
     request_id: str
@@ -69,7 +69,7 @@ class Request(Generic[Question]):
 
     @classmethod
     def of(cls, inference: Any) -> Request[Question]:
-        """Return the request of Triton's ``inference``. Its tensors are views of Triton's memory."""
+        """Return the request for Triton's ``inference``. Its tensors are views of Triton's memory."""
         request_id = inference.request_id()
         is_counted = not request_id.startswith(PROBE_PREFIX)
         request = cls(request_id, inference.requested_output_names(), inference.is_cancelled, is_counted)
@@ -84,7 +84,7 @@ class Request(Generic[Question]):
         return request
 
     def outlive(self, inference: Any) -> None:
-        """Copy the tensors and take a response sender, so that an answer can follow after ``execute``."""
+        """Copy the tensors and take a response sender, so that a response can follow after ``execute``."""
         self.sender = inference.get_response_sender()
         self.is_cancelled = self.sender.is_cancelled
         try:
@@ -100,7 +100,8 @@ class Request(Generic[Question]):
     def log_error(self) -> None:
         """Log the error.
 
-        Failures are errors. Refused and cancelled requests are logged at DEBUG, so that clients cannot fill the log.
+        Failures are logged as errors. Refused and cancelled requests are logged at DEBUG, so that clients cannot fill
+        the log.
         """
         assert self.error is not None
         level = logging.ERROR if self.outcome == FAILED else logging.DEBUG
@@ -123,26 +124,26 @@ class Request(Generic[Question]):
         return pb_utils.InferenceResponse(error=kinds(str(self.error), codes[self.outcome]))
 
     def send(self, response: Any) -> None:
-        """Send the only response to this request."""
+        """Send this request's only response."""
         import triton_python_backend_utils as pb_utils
 
         self.sender.send(response, flags=pb_utils.TRITONSERVER_RESPONSE_COMPLETE_FINAL)
 
     @property
     def sample_types(self) -> Counter[str]:
-        """Number of samples of each type."""
+        """Sample count per type."""
         if not self.questions:
             return Counter({UNKNOWN_TYPE: self.num_samples})
         return Counter(SAMPLE_TYPES[type(question)] for question in self.questions)
 
     @property
     def num_frames(self) -> int:
-        """Number of frames of all trajectories."""
+        """Total frame count over all trajectories."""
         return sum(trajectory.num_frames for question in self.questions for trajectory in question.trajectories)  # type: ignore[attr-defined]  # all questions have trajectories
 
     @property
     def outcome(self) -> str:
-        """Outcome of the request, from OUTCOMES."""
+        """The request's outcome, one of OUTCOMES."""
         if self.error is None:
             return SCORED
         if isinstance(self.error, CancelledError):

@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 class Watchdog:
     """Watches the process in its own thread, and ends it after a fault.
 
-    hang_s: longest time of a batch without progress; a forward pass is progress
+    hang_s: longest time that a batch may go without progress; a forward pass is progress
     is_working: returns True while there is a batch
     """
 
@@ -35,22 +35,22 @@ class Watchdog:
         self._is_working = is_working
         self.num_steps = 0  # forward passes and batches so far
         self._num_failed = 0
-        self._has_scored_blank = False  # only then a failure of the blank sample means a broken device
+        self._has_scored_blank = False  # only then does a failing blank sample mean a broken device
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="rfm-watchdog", daemon=True)
         self._thread.start()
 
     def step(self) -> None:
-        """Note progress: the start of a batch, or a forward pass."""
+        """Record progress: the start of a batch, or a forward pass."""
         self.num_steps += 1
 
     def look_at(self, batch: Iterable[Request[Any]], score_blank: Callable[[], None]) -> None:
         """End the process if FAILED_BATCHES batches in a row failed and the blank sample fails, too.
 
-        The blank sample decides, because inputs may cause failures. The last batch's callers must repeat their
+        The blank sample decides, because inputs may cause failures. Callers in the last batch must repeat their
         requests.
 
-        score_blank: scores the blank sample; raises its errors
+        score_blank: scores the blank sample and raises any error
         """
         outcomes = {request.outcome for request in batch}
         if SCORED in outcomes:
@@ -67,7 +67,7 @@ class Watchdog:
             end(f"instance is broken: the blank sample fails after {FAILED_BATCHES} failed batches")
 
     def close(self) -> None:
-        """End the watchdog and its thread."""
+        """Stop the watchdog and end its thread."""
         self._closed.set()
         self._thread.join()
         faulthandler.cancel_dump_traceback_later()

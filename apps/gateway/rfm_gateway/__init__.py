@@ -2,7 +2,7 @@
 """The FastAPI evaluation server's HTTP endpoints, in front of a Triton server.
 
 ``body`` and ``schema`` turn a request into samples, ``scoring`` scores them through ``AsyncRewardClient`` and writes
-the answer in the evaluation server's shape, ``app`` joins the endpoints. The gateway holds no model and no queue.
+the response in the evaluation server's format, ``app`` joins the endpoints. The gateway holds no model and no queue.
 """
 
 from rfm_gateway.command import check_gateway, gateway, gateway_command

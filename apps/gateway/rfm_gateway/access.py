@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Refuse requests without the key, and those of web pages that the gateway did not serve.
+"""Refuse requests without the key, and requests from web pages that the gateway did not serve.
 
-A page of another site can send requests to addresses that only its visitor can reach, such as 127.0.0.1. Browsers say
-so in ``Origin`` and ``Sec-Fetch-Site``, which no page can change. With DNS rebinding, the page's own name leads to such
-an address, and browsers take both servers for one. Then ``Host`` has the page's name. Starlette's
-TrustedHostMiddleware knows names alone, no rule for IP addresses; its CORSMiddleware refuses preflights alone.
+A page from another site can send requests to addresses that only its visitor can reach, such as 127.0.0.1. Browsers
+reveal this in ``Origin`` and ``Sec-Fetch-Site``, which no page can change. With DNS rebinding, the page's own name
+resolves to such an address, so browsers take both servers for one; then ``Host`` has the page's name. Starlette's
+middleware falls short: TrustedHostMiddleware knows names but no rule for IP addresses, and CORSMiddleware refuses only
+preflights.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from rfm_gateway.config import GatewayConfig
 from rfm_gateway.refusals import refuse
 
-_NEVER_PUBLIC = ("local", "internal", "lan", "svc")  # top-level domains that the public DNS does not have
-_MOST_LETTERS = 100  # of a header in an answer
+_NEVER_PUBLIC = ("local", "internal", "lan", "svc")  # top-level domains that do not exist in public DNS
+_MOST_LETTERS = 100  # quoted from a header in a response
 _HEADER = APIKeyHeader(name="X-API-Key", auto_error=False)  # at module level, where FastAPI resolves annotations
 _BEARER = HTTPBearer(auto_error=False)
 _BASIC = HTTPBase(
@@ -41,13 +42,13 @@ _EXPECTED_KEY = (
     "key: expected it in X-API-Key, in Authorization: Bearer, or as the password of HTTP Basic (http://any:KEY@HOST), "
     "got another or none"
 )
-_CHALLENGE = "Bearer"  # not Basic, for which a browser would ask its user for a password
+_CHALLENGE = "Bearer"  # not Basic: a browser would ask its user for a password
 
 
 class ForeignPageMiddleware:
-    """ASGI middleware that answers 421 to a foreign ``Host`` and 403 to a request of a foreign page.
+    """ASGI middleware that answers 421 to a foreign ``Host`` and 403 to requests from foreign pages.
 
-    has_key: True: every host is taken, since a page has no key
+    has_key: True: accept every host, because a page has no key
     """
 
     def __init__(self, app: ASGIApp, config: GatewayConfig, *, has_key: bool) -> None:
@@ -65,7 +66,7 @@ class ForeignPageMiddleware:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 headers["Cross-Origin-Resource-Policy"] = "same-origin"  # without TLS, browsers do not say who asks
-                headers.setdefault("Content-Security-Policy", "frame-ancestors 'none'")  # a page's own says so, too
+                headers.setdefault("Content-Security-Policy", "frame-ancestors 'none'")  # a page's own has it, too
             await send(message)
 
         refusal = self._refusal(scope) if scope["type"] == "http" else None
@@ -89,8 +90,8 @@ class ForeignPageMiddleware:
     def _is_known(self, host: str) -> bool:
         """True for names that a foreign page cannot have.
 
-        On a loopback address these are ``localhost`` and IP addresses. On others, also names of the local network:
-        whoever can choose those can reach the gateway without a browser.
+        On a loopback address these are ``localhost`` and IP addresses. On others, local network names also count:
+        whoever can assign those can reach the gateway without a browser.
         """
         try:
             name = (urlsplit(f"//{host}").hostname or "").removesuffix(".")
@@ -119,7 +120,7 @@ def key_check(key: str) -> Callable[..., Awaitable[None]]:
     """Return a dependency that refuses requests without the key."""
     expected = key.encode()
 
-    async def check(  # not in a thread, as FastAPI would run a plain function
+    async def check(  # async, because FastAPI would run a plain function in a thread
         in_header: Annotated[str | None, Depends(_HEADER)],
         in_bearer: Annotated[HTTPAuthorizationCredentials | None, Depends(_BEARER)],
         in_basic: Annotated[HTTPAuthorizationCredentials | None, Depends(_BASIC)],
@@ -134,7 +135,7 @@ def key_check(key: str) -> Callable[..., Awaitable[None]]:
 
 
 def _password(credentials: HTTPAuthorizationCredentials | None) -> bytes:
-    """Return the password of HTTP Basic; empty: another scheme, or malformed."""
+    """Return the HTTP Basic password; empty: another scheme, or malformed."""
     if credentials is None or credentials.scheme.lower() != "basic":
         return b""
     try:

@@ -69,8 +69,8 @@ def create_app(
     """Return the application.
 
     api_key: key that requests must show, except for health and documentation; None: no key
-    started_by: the command that a person repeats to start this gateway again
-    client: of Triton; None: as ``config`` says
+    started_by: the command that a person repeats to restart this gateway
+    client: for Triton; None: as ``config`` says
 
     Raises OSError for a missing folder, ValueError for a malformed URL or an unusable file.
     """
@@ -94,7 +94,7 @@ def create_app(
         redoc_url=None,
         exception_handlers=_handlers(),
     )
-    app.add_middleware(ForeignPageMiddleware, config=config, has_key=api_key is not None)  # the innermost
+    app.add_middleware(ForeignPageMiddleware, config=config, has_key=api_key is not None)  # innermost
     app.add_middleware(RequestMiddleware, metrics=metrics)
     if config.cors_origin:
         app.add_middleware(
@@ -104,7 +104,7 @@ def create_app(
             allow_headers=["*"],
             expose_headers=[REQUEST_ID_HEADER, WARNING_HEADER],
         )
-    app.add_middleware(LingerMiddleware)  # the outermost: the answer is counted before
+    app.add_middleware(LingerMiddleware)  # outermost: responses are counted before it lingers
     guards = [] if api_key is None else [Depends(key_check(api_key))]
     guarded = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
     evaluator = Evaluator(client, limits, parts, folder, config.use_frame_steps, config.refuse_blank)
@@ -236,7 +236,7 @@ def _handlers() -> dict[Any, Any]:
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
-    """Return the OpenAPI document, with the schemas of bodies: endpoints read those from the stream, undeclared."""
+    """Return the OpenAPI document, with body schemas added: endpoints read bodies from the stream, undeclared."""
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
         _, models = models_json_schema([(model, "validation") for model in _MODELS], ref_template=_REFERENCE)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read the samples of a request's body, JSON or multipart with arrays as files, within limits."""
+"""Read samples from a request body, JSON or multipart with arrays as files, within limits."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from rfm_client.serving import off_loop
 from rfm_gateway import schema
 from rfm_gateway.field_errors import STEPS_FIELD, Path, field_errors, invalid
 
-DECODED_PER_BODY = 2  # limit of decoded files, as a multiple of the body's limit
-MAX_PARTS = 2000  # of one multipart request: each takes memory, also if it is empty
-IN_MEMORY_BYTES = 32 * 2**20  # of a file; larger files lie on disk
-MAX_SAMPLES = 10_000  # of one request
+DECODED_PER_BODY = 2  # limit for decoded files, as a multiple of the body's limit
+MAX_PARTS = 2000  # per multipart request: even an empty part takes memory
+IN_MEMORY_BYTES = 32 * 2**20  # per file; larger files lie on disk
+MAX_SAMPLES = 10_000  # per request
 MAX_JSON_BYTES = 32 * 2**20  # large arrays come as files
 AS_FILES = "send arrays as .npy files, to /evaluate_batch_npy"
 LARGER = "send less in one request, or start the gateway with --max-body-mib (rfm serve: --gateway-max-body-mib)"
 
 _format: Any = np.lib.format  # numpy declares no types for it
-_BROKEN_NPY = (ValueError, TypeError, LookupError, SyntaxError, TokenError, MemoryError, RecursionError)  # its errors
+_BROKEN_NPY = (ValueError, TypeError, LookupError, SyntaxError, TokenError, MemoryError, RecursionError)  # numpy errors
 _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
 _SAMPLE_FIELD = re.compile(r"sample_(0|[1-9][0-9]{0,5})")
 _CHARSETS = ("utf-8", "utf8", "us-ascii")
@@ -48,11 +48,11 @@ Take: TypeAlias = Callable[[int], object]  # takes bytes from a budget, or raise
 
 @dataclass(frozen=True)
 class Batch:
-    """The samples of one request, at least one.
+    """The samples in one request, at least one.
 
-    paths: of each sample in the body, for errors
+    paths: each sample's path in the body, for errors
     use_frame_steps: True: progress samples are scored frame by frame; None: the request does not say
-    num_bytes: size of the body
+    num_bytes: body size
     """
 
     samples: list[schema.Sample]
@@ -63,7 +63,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class BodyLimits:
-    """Limits of a request's body: its size, of JSON at most MAX_JSON_BYTES, and its time of arrival.
+    """Limits on a request body: size, at most MAX_JSON_BYTES for JSON, and time to arrive.
 
     Reading raises HTTPException 413 as soon as the announced or received size is too large, and TimeoutError.
     """
@@ -81,7 +81,8 @@ class BodyLimits:
     def decoding(self) -> Iterator[Take]:
         """Yield a function that takes bytes from one request's budget for decoded files, before they are decoded.
 
-        It raises HTTPException 413 if too few are left, and always after the context, so that threads stop decoding.
+        The function raises HTTPException 413 if too few are left, and always after the context, so that threads stop
+        decoding.
         """
         most_bytes = DECODED_PER_BODY * self.max_bytes
         left_bytes: float = most_bytes
@@ -100,10 +101,10 @@ class BodyLimits:
 
     @asynccontextmanager
     async def form(self, request: Request) -> AsyncIterator[tuple[dict[str, str], dict[str, UploadFile]]]:
-        """Yield fields and files of a multipart request by name. The files exist until the context ends.
+        """Yield a multipart request's fields and files by name. The files exist until the context ends.
 
-        Raises RequestValidationError for two parts of the same name, HTTPException 415 for another content type and 400
-        for a malformed or incomplete body, which may lack a sample.
+        Raises RequestValidationError for two parts with the same name, HTTPException 415 for another content type and
+        400 for a malformed or incomplete body, which may lack a sample.
         """
         kind, options = parse_options_header(request.headers.get("content-type", ""))
         if kind != b"multipart/form-data" or not options.get(b"boundary"):
@@ -117,7 +118,7 @@ class BodyLimits:
         try:
             with anyio.fail_after(self.timeout_s):
                 form = await parser.parse()
-        except (MultiPartException, ValueError) as error:  # ValueError: of python_multipart
+        except (MultiPartException, ValueError) as error:  # python_multipart raises ValueError
             raise HTTPException(400, f"body: expected multipart/form-data, got: {error}") from None
         try:
             if not parser.has_ended:
@@ -147,7 +148,7 @@ class BodyLimits:
 
 
 class _Form(MultiPartParser):
-    """Starlette's parser, with a bound for parts and a flag for the last boundary."""
+    """Starlette's parser, with a part limit and a flag for the last boundary."""
 
     spool_max_size = IN_MEMORY_BYTES
     has_ended = False
@@ -165,15 +166,15 @@ class _Form(MultiPartParser):
 
 
 async def read_json(limits: BodyLimits, request: Request) -> Batch:
-    """Return the samples of a JSON request. Raises RequestValidationError and the errors of ``limits``."""
+    """Return the samples in a JSON request. Raises RequestValidationError and the errors from ``limits``."""
     body = await limits.read_json(request)
     return await off_loop(len(body), _of_json, body)
 
 
 async def read_multipart(limits: BodyLimits, request: Request) -> Batch:
-    """Return the samples of a multipart request. Large files lie on disk until they are decoded.
+    """Return the samples in a multipart request. Large files lie on disk until they are decoded.
 
-    Raises RequestValidationError and the errors of ``limits``.
+    Raises RequestValidationError and the errors from ``limits``.
     """
     async with limits.form(request) as (fields, uploads):
         for name in uploads:
@@ -225,7 +226,7 @@ def _flag(value: Any, flags: Mapping[str, bool] = _FLAGS) -> bool | None:
 def _parsed(text: bytes | str, loc: tuple[str, ...]) -> Any:
     try:
         return from_json(text)
-    except (ValueError, TypeError) as error:  # TypeError: text that is no UTF-8
+    except (ValueError, TypeError) as error:  # TypeError: text that is not UTF-8
         raise invalid(loc, f"expected JSON, got: {error}", "json_invalid") from None
 
 

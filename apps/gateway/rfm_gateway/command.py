@@ -19,7 +19,7 @@ from rfm_client.serving import DEFAULT_MODEL, raise_limit, write_log
 from rfm_gateway.config import DEFAULT_HOST, DEFAULT_PORT, MAX_PORT, GatewayConfig
 
 KEEP_ALIVE_S = 30
-MAX_HEAD_BYTES = 64 * 2**10  # of a request; also of its trailers
+MAX_HEAD_BYTES = 64 * 2**10  # for a request; also for its trailers
 STOP_WITHIN_S = 30
 logger = logging.getLogger("rfm_gateway")
 
@@ -57,7 +57,7 @@ def gateway(config: GatewayOptions) -> None:
         api_key, options = config.api_key(os.environ), server_options(config)
         app = create_app(config, api_key, _started_by(sys.argv[0]))
         address.check_free("gateway", port_option="--port")
-    except ConfigError:  # with_options names its option
+    except ConfigError:  # with_options names the option
         raise
     except (ValueError, OSError) as error:
         raise typer.BadParameter(str(error)) from None
@@ -91,7 +91,7 @@ def server_options(config: GatewayConfig) -> dict[str, Any]:
 
 
 def check_gateway(config: GatewayConfig, environment: Mapping[str, str]) -> None:
-    """Raise ValueError or OSError for settings with which a gateway beside ``rfm serve`` would not start."""
+    """Raise ValueError or OSError for settings that would keep a gateway beside ``rfm serve`` from starting."""
     from rfm_gateway.app import create_app
 
     config.address.check_free("port", port_option="--gateway-port", host_option="--gateway-host")
@@ -120,5 +120,5 @@ def _started_by(program: str) -> str:
 
 
 def page_link(config: GatewayConfig) -> str:
-    """Return the URL of the page and the endpoints, for callers that can reach the address."""
+    """Return the URL for the page and the endpoints, for callers that can reach the address."""
     return f"{config.address.url('http' if config.certificate is None else 'https')}/"

@@ -31,7 +31,7 @@ _SHORTEST_S, _LONGEST_S = 0.001, 86_400.0  # a day
 
 @dataclass(frozen=True)
 class GatewayConfig(Settings):
-    """Settings of a gateway: addresses, credentials, limits. docs/reference/gateway.md explains them.
+    """Settings for a gateway: addresses, credentials, limits. docs/reference/gateway.md explains them.
 
     Addresses may be None, because ``rfm serve`` and ``rfm gateway`` have different defaults for them.
     """
@@ -84,7 +84,7 @@ class GatewayConfig(Settings):
 
     @property
     def triton_url(self) -> str:
-        """URL of Triton. Raises ConfigError if there is none."""
+        """Triton's URL. Raises ConfigError if there is none."""
         if self.triton is None:
             raise ConfigError.at("triton", "the URL of a Triton", "none")
         return self.triton
@@ -116,7 +116,7 @@ class GatewayConfig(Settings):
         return self.model or DEFAULT_MODEL
 
     def client(self, checkpoint: str | None = None) -> AsyncRewardClient:
-        """Return a client of Triton. Raises ValueError for a malformed URL or unusable files.
+        """Return a client for Triton. Raises ValueError for a malformed URL or unusable files.
 
         checkpoint: name of another export; None: the gateway's
         """
@@ -133,7 +133,7 @@ class GatewayConfig(Settings):
             raise ConfigError.like(error, where="triton") if error.where == "url" else error from None
 
     async def status(self, timeout_s: float) -> ServerStatus:
-        """Read the state of Triton and of its devices. Raises ServerError."""
+        """Read the state of Triton and the devices. Raises ServerError."""
         return await asyncio.to_thread(
             ServerStatus.read,
             self.triton_url,
@@ -144,7 +144,7 @@ class GatewayConfig(Settings):
 
     @property
     def tls(self) -> dict[str, Any]:
-        """Arguments of uvicorn for TLS. Raises ConfigError for unusable files."""
+        """TLS arguments for uvicorn. Raises ConfigError for unusable files."""
         if self.certificate is None or self.key is None:
             return {}
         check_certificate(self.certificate, self.key, "certificate")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Errors at the fields of a request, as 422 lists them: ``expected X, got Y; remedy`` and the path that was sent."""
+"""Errors in request fields, as 422 lists them: ``expected X, got Y; remedy`` and the path that was sent."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from pydantic import ValidationError
 from rfm_client import InvalidSampleError
 from rfm_gateway import schema
 
-MAX_ERRORS = 1000  # listed in an answer
+MAX_ERRORS = 1000  # listed in one response
 STEPS_FIELD = "use_frame_steps"
 
-Path: TypeAlias = tuple[str | int, ...]  # of a field, below the body
+Path: TypeAlias = tuple[str | int, ...]  # path to a field, below the body
 
-_EXPECTED = {  # the expected value, by pydantic's kind of error
+_EXPECTED = {  # the expected value, by pydantic's error type
     "string_type": "text",
     "dict_type": "an object",
     "model_type": "an object",
@@ -36,20 +36,20 @@ _SIDES = {  # the gateway's fields, by the client's names
     "reference": "ref_trajectory",
     "other": "sim_trajectory",
 }
-_OF_SAMPLE = ("sample_type", "answer")  # fields of a model's errors that are not of a trajectory
+_OF_SAMPLE = ("sample_type", "answer")  # fields that a model's error may name outside any trajectory
 _FEWER_FRAMES = f"send fewer frames, such as some at equal distances, or {STEPS_FIELD}"
 _SMALLER = "send smaller or fewer frames"
 
 
 def invalid(loc: Path, message: str, kind: str = "value_error") -> RequestValidationError:
-    """Return an error at a field of the body, in the form of FastAPI's own errors."""
+    """Return an error at a body field, in the format that FastAPI uses."""
     return RequestValidationError([{"type": kind, "loc": ["body", *loc], "msg": message}])
 
 
 def field_errors(error: ValidationError) -> list[dict[str, Any]]:
-    """Return pydantic's errors in the gateway's form, ``expected X, got Y`` at a path.
+    """Return pydantic's errors in the gateway's format, ``expected X, got Y`` at a path.
 
-    Raises RequestValidationError with only their number if there are more than MAX_ERRORS.
+    Raises a RequestValidationError that gives only their count if there are more than MAX_ERRORS.
     """
     if error.error_count() > MAX_ERRORS:
         raise invalid((), f"expected no faulty fields, got {error.error_count()}")
@@ -61,8 +61,8 @@ def refused(
 ) -> RequestValidationError:
     """Return an error that lists all invalid samples.
 
-    errors: of the client, by the index of the sample
-    paths: path of each sample
+    errors: the client's errors, by sample index
+    paths: each sample's path
     """
     details: list[Any] = []
     for index, error in errors.items():
@@ -73,14 +73,14 @@ def refused(
 
 
 def _placed(words: list[str], error: InvalidSampleError, sample: schema.Sample) -> tuple[Path, str]:
-    """Return the path below the sample of a client's or a model's error, and its message."""
+    """Return the path below the sample for a client's or a model's error, and the message."""
     *around, field = words or [""]
     message = error.problem
     if field == "frame_steps":
         return (STEPS_FIELD,), f"expected false with this model, got true: {message}"
     if field == "num_frames":
         message = f"expected {error.expected}, got {error.got}; {_FEWER_FRAMES}"
-    elif error.remedy and not around:  # of the client, whose remedy is an option in Python
+    elif error.remedy and not around:  # from the client, whose remedy is an option in Python
         message = f"expected {error.expected}, got {error.got}; {_SMALLER}"
     path = [int(word) if word.isdecimal() else _SIDES.get(word, word) for word in [*around, field] if word]
     if around or field in _OF_SAMPLE or not path:
@@ -89,13 +89,13 @@ def _placed(words: list[str], error: InvalidSampleError, sample: schema.Sample) 
 
 
 def _of_trajectory(field: str, sample: schema.Sample) -> Path:
-    """Return the path of a field that a model names without the trajectory; of either, that of the sample."""
+    """Return the path for a field that a model names without its trajectory; if ambiguous, the sample's path."""
     names = list(sample.named_trajectories)
     if field in names or _SIDES.get(field) in names:
         return (_SIDES.get(field, field),)
     if field == "second_frames":
         return (names[-1], "frames")
-    if field in ("task", "text_embedding"):  # of the first, which the model reads
+    if field in ("task", "text_embedding"):  # in the first trajectory, which the model reads
         names = names[:1]
     if len(names) > 1:
         return ()

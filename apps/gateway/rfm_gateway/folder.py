@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read the files that requests name, only from a folder that the operator allows, and no pickle."""
+"""Read the files that requests name: only from a folder that the operator allows, and never pickle."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RequestFiles:
-    """The files of one request.
+    """The files for one request.
 
     folder: the allowed folder, with links resolved; None: no file is read
     take: called with the decoded size of files before they are read
 
-    Its methods raise InvalidSampleError, and what ``take`` raises.
+    Methods raise InvalidSampleError, and what ``take`` raises.
     """
 
     folder: Path | None
     take: Take
 
     def frames(self, names: Sequence[str]) -> UInt8Array:
-        """Return the T named images as uint8 [T, H, W, 3], RGB, upright as their EXIF data say."""
+        """Return the T named images as uint8 [T, H, W, 3], RGB, turned upright by EXIF data."""
         with self._image(names[0], "frames.0") as first:
             num_pixels = first.height * first.width
         self.take(len(names) * num_pixels * 3)
@@ -93,7 +93,7 @@ class RequestFiles:
 
 
 def _unpacked_bytes(file: Path) -> int:
-    """Return the size of the unpacked arrays in a .npy or .npz file."""
+    """Return the unpacked size of the arrays in a .npy or .npz file."""
     if file.suffix.lower() == ".npz":
         with ZipFile(file) as archive:
             return sum(entry.file_size for entry in archive.infolist())

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Pages in the browser: Swagger UI, and the page that another package brings.
+"""Browser pages: Swagger UI, and the page that another package brings.
 
-Their files are installed, so they need no network. The other package's entry point in the group ``rfm_gateway.page``
-names an ``AddPage``.
+The page files are installed, so they need no network. The other package's entry point in the group
+``rfm_gateway.page`` names an ``AddPage``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _HEADERS = {
 
 
 class _Files(StaticFiles):
-    """The files of a folder, with the headers of a page."""
+    """Serves the files in a folder, with a page's headers."""
 
     def file_response(self, *arguments: Any, **options: Any) -> Response:
         response = super().file_response(*arguments, **options)
@@ -49,15 +49,15 @@ class _Files(StaticFiles):
 
 
 def add_docs(app: FastAPI) -> None:
-    """Add Swagger UI at ``/docs``, and its files."""
+    """Add Swagger UI and its files at ``/docs``."""
     _add_files(app, "/docs", "/docs", _PACKAGE / "docs", **{"swagger-ui": _PACKAGE / "vendored" / "swagger-ui"})
 
 
 def _add_files(app: FastAPI, page: str, path: str, folder: Path, **folders: Path) -> None:
     """Add a page whose ``index.html`` is in ``folder``.
 
-    page: path of the page
-    path: of its files
+    page: path where the page is served
+    path: path where its files are served
     folders: more of its files, by the name below ``path``
     """
     files = _Files(directory=folder)
@@ -76,8 +76,8 @@ class PageHost:
     """The gateway that serves a page.
 
     guards: refuse requests without the gateway's key
-    place: of endpoints that score: waits for a place among the evaluations at a time
-    started_by: the command that a person repeats to start the gateway again: ``rfm serve`` or one of its own
+    place: for endpoints that score: waits until another evaluation may run
+    started_by: the command that a person repeats to restart the gateway: ``rfm serve`` or a gateway command
     """
 
     app: FastAPI
@@ -93,7 +93,7 @@ class PageHost:
         self.app.include_router(router, dependencies=self.guards)
 
     def add_files(self, folder: Path, **folders: Path) -> None:
-        """Serve ``index.html`` at ``/`` and the files of ``folder`` at ``/viewer``, after its endpoints, without a key.
+        """Serve ``index.html`` at ``/`` and the files in ``folder`` at ``/viewer``, after the endpoints, without a key.
 
         folders: more files, by the name below ``/viewer``
         """
@@ -104,7 +104,7 @@ AddPage: TypeAlias = Callable[[PageHost], None]  # adds a page; raises ConfigErr
 
 
 def page_of(config: GatewayConfig) -> AddPage | None:
-    """Return what adds the page; None: the gateway serves none.
+    """Return the function that adds the page; None: the gateway serves none.
 
     Raises ConfigError if it should show a dataset, but no page is installed.
     """

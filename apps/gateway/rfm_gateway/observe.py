@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Count requests for Prometheus, bound those at a time, and cancel work that is late or whose caller has hung up."""
+"""Count requests for Prometheus, limit concurrent ones, and cancel work that is late or whose caller has hung up."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _BUCKETS_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0
 
 
 class GatewayMetrics:
-    """The Prometheus metrics of one gateway."""
+    """The Prometheus metrics for one gateway."""
 
     def __init__(self) -> None:
         self._registry = CollectorRegistry()
@@ -75,7 +75,7 @@ class GatewayMetrics:
             self.rejections.labels(REJECTIONS.get(code, "other")).inc()
 
     def text(self) -> bytes:
-        """Return the metrics in the text format of Prometheus."""
+        """Return the metrics in Prometheus text format."""
         return generate_latest(self._registry)
 
 
@@ -89,7 +89,7 @@ class Places:
         metrics.waiting.set_function(lambda: self._places.statistics().tasks_waiting)
 
     async def taken(self) -> AsyncGenerator[None, None]:
-        """Dependency of endpoints: take a place before the body is read, and give it back after the answer.
+        """Endpoint dependency: take a place before the body is read, and give it back after the response.
 
         Raises HTTPException 503 if too many wait, or no place is free within ``timeout_s``.
         """
@@ -115,14 +115,14 @@ class RequestMiddleware:
         self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve a request, and count it with its answer."""
+        """Serve a request, and count it once it is answered."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
         started_s = time.perf_counter()
         request_id = begin_request(Headers(scope=scope).get(REQUEST_ID_HEADER, ""))
         scope.setdefault("state", {})["request_id"] = request_id
-        code = 500  # unless an answer begins
+        code = 500  # unless a response begins
 
         async def send_counted(message: Message) -> None:
             nonlocal code
@@ -142,7 +142,7 @@ class CallerLeftError(Exception):
 
 
 async def while_connected(request: Request, work: Coroutine[Any, Any, Returned]) -> Returned:
-    """Return the result of ``work``. Read the request's body before.
+    """Return the result of ``work``. Read the request body before.
 
     If the caller hangs up, cancels ``work`` with its requests to Triton and raises CallerLeftError.
     """
@@ -160,7 +160,7 @@ async def while_connected(request: Request, work: Coroutine[Any, Any, Returned])
 
 
 async def within(timeout_s: float, work: Coroutine[Any, Any, Returned]) -> Returned:
-    """Return the result of ``work``, calls of Triton. Cancels it and raises DeadlineExceededError if it is late."""
+    """Return the result of ``work``, which calls Triton. Cancels late work and raises DeadlineExceededError."""
     try:
         return await asyncio.wait_for(work, timeout_s)
     except (asyncio.TimeoutError, DeadlineExceededError) as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Answer requests that are refused or fail so that callers see it, and log why, since many never show the text."""
+"""Let callers see why a request is refused or fails, and log it: many callers never show the text."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LINGER_S = 10.0  # as aiohttp
-_MOST_LETTERS = 500  # of a reason
-_MOST_NAME_LETTERS = 100  # of a path or a program
+_MOST_LETTERS = 500  # in a logged reason
+_MOST_NAME_LETTERS = 100  # in a logged path or program
 
 logger = logging.getLogger("rfm_gateway.refusals")
 
 
 def refuse(scope: Scope, code: int, detail: Any, headers: Mapping[str, str] | None = None) -> JSONResponse:
-    """Write a line to the log, and return the answer with this status, 400 or above.
+    """Write a line to the log, and return the response with this status, 400 or above.
 
-    detail: text, or errors at fields as ``field_errors.invalid`` makes them
+    detail: text, or field errors as ``field_errors.invalid`` makes them
     """
     logger.warning("%d %s: %s", code, asked(scope), _reason(detail))
     return JSONResponse({"detail": detail}, code, headers)
 
 
 class LingerMiddleware:
-    """ASGI middleware that goes on reading a body after the answer, for at most LINGER_S, and drops it.
+    """ASGI middleware that reads and drops the rest of a body after the response, for at most LINGER_S.
 
     Closing a connection with unread bytes resets it. Callers that send all before they read, such as urllib, would get
-    that instead of the refusal.
+    the reset instead of the refusal.
     """
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve a request. The answer ends, and with it the connection, when the body has ended."""
+        """Serve a request. The response, and with it the connection, ends once the body has ended."""
         is_read = is_answered = False
 
         async def receive_to_the_end() -> Message:

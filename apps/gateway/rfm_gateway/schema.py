@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Requests and answers of the evaluation server.
+"""Requests and responses of the evaluation server.
 
-Field names are those of ``dataset_types.py`` of reward_fm and robometer. Other fields are ignored, as upstream does.
-T frames, H x W pixels, D width of a frame embedding, Dt width of a text embedding.
+Field names come from ``dataset_types.py`` in reward_fm and robometer. Other fields are ignored, as upstream does.
+T frames, H x W pixels, D frame embedding width, Dt text embedding width.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pydantic import (
 from rfm_client import InvalidSampleError, UInt8Array, float_frames_to_uint8
 
 UPLOAD_KEY = "__numpy_file__"
-MAX_AXES = 4  # of frames, [T, H, W, 3]
+MAX_AXES = 4  # in frames, [T, H, W, 3]
 RGB_CHANNELS, RGBA_CHANNELS = 3, 4
 
 _UPLOADED = {
@@ -66,7 +66,7 @@ def _array(value: Any, info: ValidationInfo) -> Any:
 
 
 def _check_leaves(array: list[Any]) -> None:
-    """Check the leaves before numpy reads them: with a text, it would make every element as wide as the longest."""
+    """Check the leaves before numpy reads them: a text would make every element as wide as the longest."""
     for axis in range(MAX_AXES):
         values: Iterable[Any] = array
         for _ in range(axis):
@@ -82,7 +82,7 @@ def _check_leaves(array: list[Any]) -> None:
 
 
 def _frames(value: Any, info: ValidationInfo) -> Any:
-    """Return an array of frames, or the list of names of image files."""
+    """Return an array of frames, or a list of image file names."""
     if isinstance(value, list) and value and all(isinstance(name, str) for name in value):
         return value
     return _array(value, info)
@@ -126,14 +126,14 @@ class TrajectoryInput(BaseModel):
 
     @property
     def has_embeddings(self) -> bool:
-        """True with embeddings, or with a file of embeddings and no frames."""
+        """True with embeddings, or with an embeddings file and no frames."""
         return self.video_embeddings is not None or (self.embeddings_path is not None and self.frames is None)
 
     @property
     def uint8_frames(self) -> UInt8Array:
-        """The frames of an array as uint8 [T, H, W, C], converted as the evaluation server does.
+        """The frames as an uint8 array [T, H, W, C], converted as the evaluation server does.
 
-        Floats are clipped and truncated. A single frame becomes a video of one frame. RGBA loses its alpha channel.
+        Floats are clipped and truncated. A single frame becomes a one-frame video. RGBA loses its alpha channel.
         Raises InvalidSampleError for integers outside 0..255, and for other types and shapes.
         """
         _check_axes(self.frames)
@@ -162,7 +162,7 @@ class _Sample(BaseModel):
 
     @property
     def named_trajectories(self) -> dict[str, TrajectoryInput]:
-        """The trajectories by field name, in the order of scoring."""
+        """The trajectories by field name, in scoring order."""
         return {name: value for name, value in self if isinstance(value, TrajectoryInput)}
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Convert a request's samples for the client, score them, and write the evaluation server's answer."""
+"""Convert a request's samples for the client, score them, and write the evaluation server's response."""
 
 from __future__ import annotations
 
@@ -41,24 +41,24 @@ from rfm_gateway.folder import RequestFiles
 from rfm_gateway.observe import within
 from rfm_gateway.state import ServedParts
 
-FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
-FRAME_STEPS_OF_SECONDS = 8  # the same, for a model of remaining seconds
+FRAME_STEPS = 4  # the evaluation server samples each prefix to this many frames
+FRAME_STEPS_OF_SECONDS = 8  # the same, for a model that predicts remaining seconds
 PREFERRED = 0.5
 CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the chosen trajectory is first, and better
-WARNING_HEADER = "X-RFM-Warning"  # of answers whose scores mean nothing
+WARNING_HEADER = "X-RFM-Warning"  # on responses whose scores mean nothing
 PADDING = "frames of zeros at the end (send the real frames alone, without padding)"
 MOST_NAMES = 12  # samples that a warning names
-_BLANK = np.zeros((1, 32, 32, 3), np.uint8)  # sent with a task to get only the embedding of the task
+_BLANK = np.zeros((1, 32, 32, 3), np.uint8)  # sent with a task to get only the task embedding
 
-Text: TypeAlias = Float32Array | InvalidSampleError  # the embedding of a task, or the encoder's error
+Text: TypeAlias = Float32Array | InvalidSampleError  # a task's embedding, or the encoder's error
 
 
 @dataclass(frozen=True)
 class Evaluator:
     """Scores batches with the server behind ``client``.
 
-    parts: that were served: one that is missing now is an error of the server
-    folder: folder of files that samples may name, with links resolved; None: no files
+    parts: parts that were served: if one is missing now, that is a server error
+    folder: folder with files that samples may name, with links resolved; None: no files
     use_frame_steps: for requests that do not say
     refuse_blank: True: black and single-colour frames are invalid
     """
@@ -71,9 +71,9 @@ class Evaluator:
     refuse_blank: bool
 
     async def evaluate(self, batch: Batch, request_id: str) -> tuple[schema.EvaluateBatchAnswer, str]:
-        """Return the answer to a whole batch, and a warning of samples that show nothing; empty: there are none.
+        """Return the response for a whole batch, and a warning about samples that show nothing; empty: none do.
 
-        A missing sample would shift later scores, or be read as a reward of 0.
+        No sample may be left out: that would shift later scores, or be read as a reward of 0.
 
         Raises RequestValidationError that lists all invalid samples, HTTPException for files that are too large, and
         ServerError.
@@ -83,7 +83,7 @@ class Evaluator:
             try:
                 return await within(self.limits.timeout_s, scoring)
             except Exception as error:
-                clear_frames(error.__traceback__)  # otherwise errors among their variables keep the arrays in memory
+                clear_frames(error.__traceback__)  # otherwise the traceback's variables keep the arrays in memory
                 raise
 
     async def _evaluate(
@@ -116,8 +116,8 @@ class Evaluator:
     async def _served(self, samples: Sequence[schema.Sample]) -> tuple[ModelInfo | None, ModelInfo | None]:
         """Return the models for embeddings and for raw frames that can score the samples; None: not served, or unused.
 
-        Asks about the model for frames only if a sample may need it, because the client does not cache that a model is
-        missing and would send a request each time.
+        Asks about the frame model only if a sample may need it: the client does not cache that a model is missing, and
+        would send a request each time.
         """
         given = [trajectory for sample in samples for trajectory in sample.named_trajectories.values()]
         embedded = [trajectory.has_embeddings for trajectory in given]
@@ -149,7 +149,7 @@ class Evaluator:
     async def _text(self, task: str, request_id: str) -> Text:
         try:
             encoded = await self.client.encode(Trajectory(frames=_BLANK, task=task), request_id=request_id)
-        except InvalidSampleError as error:  # of this task alone
+        except InvalidSampleError as error:  # for this task alone
             return error
         assert encoded.text_embedding is not None
         return encoded.text_embedding
@@ -157,7 +157,7 @@ class Evaluator:
 
 @dataclass(frozen=True)
 class _Conversion:
-    """Conversion of one request's samples.
+    """Converts one request's samples.
 
     embedding_model, frame_model: models that score them; None: not served, or unused
     texts: embeddings by task
@@ -173,7 +173,7 @@ class _Conversion:
     refuse_blank: bool
 
     def samples(self, batch: Batch) -> tuple[list[Sample], str]:
-        """Return the client's samples, and the warning of those that show nothing.
+        """Return the client's samples, and a warning about those that show nothing.
 
         Raises RequestValidationError that lists all invalid samples, and HTTPException as ``RequestFiles`` does.
         """
@@ -247,7 +247,7 @@ def _frame_steps(frames: ModelInfo | None) -> int:
 
 
 def _prefixes(sample: Sample) -> list[Sample]:
-    """Return a sample of raw frames for each prefix of a progress sample; another sample alone."""
+    """Return a raw-frame sample for each prefix of a progress sample; any other sample alone."""
     if not isinstance(sample, ProgressSample):
         return [sample]
     trajectory, frames = sample.trajectory, sample.trajectory.positions
@@ -255,7 +255,7 @@ def _prefixes(sample: Sample) -> list[Sample]:
 
 
 def _results(outcomes: Sequence[Sequence[Result | RewardError]], batch: Batch) -> list[Result]:
-    """Return the result of each sample from the outcomes of its prefixes, or from its only outcome.
+    """Return each sample's result, from the outcomes of its prefixes or from its only outcome.
 
     Raises RequestValidationError that lists all invalid samples, else the first error.
     """
@@ -270,7 +270,7 @@ def _results(outcomes: Sequence[Sequence[Result | RewardError]], batch: Batch) -
 
 
 def _joined(results: Sequence[Result]) -> Result:
-    """Return the last scores of each prefix; a single result as it is. Raises InferenceFailedError."""
+    """Return each prefix's last scores; a single result as it is. Raises InferenceFailedError."""
     if len(results) == 1:
         return results[0]
     newest = slice(-1, None)
@@ -278,14 +278,14 @@ def _joined(results: Sequence[Result]) -> Result:
 
 
 def _progress(result: ProgressResult) -> Float32Array:
-    """Return progress; of a model of seconds minus the seconds, as the evaluation server's default mode answers."""
+    """Return progress; for a model of seconds, minus the seconds, as in the evaluation server's default mode."""
     return result.progress if result.remaining_s is None else -result.remaining_s
 
 
 def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: int) -> schema.EvaluateBatchAnswer:
-    """Return the evaluation server's answer for these results.
+    """Return the evaluation server's response for these results.
 
-    group: number of frames that share a value; the answer has each value once
+    group: frames that share a value; the response has each value once
     """
     progress = [result for result in results if isinstance(result, ProgressResult)]
     preferences = [result.preference for result in results if isinstance(result, PreferenceResult)]
@@ -317,7 +317,7 @@ def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: 
 
 
 def warning_of(samples: Sequence[Sample]) -> str:
-    """Return a warning that names the samples with blank frames, or with zeros at the end; empty if there are none."""
+    """Return a warning that names samples with blank frames, or with zeros at the end; empty if there are none."""
     shown = [(index, t.frames) for index, sample in enumerate(samples) for t in sample.trajectories if t is not None]
     clips = [(index, frames, BlankFrames(frames)) for index, frames in shown if frames is not None]
     blank = {index: found for index, _, found in clips if found.told}
@@ -332,7 +332,7 @@ def warning_of(samples: Sequence[Sample]) -> str:
 
 
 def refuse_blank_frames(trajectory: Trajectory) -> None:
-    """Raise InvalidSampleError for blank frames, and for frames of zeros at the end."""
+    """Raise InvalidSampleError for blank frames, and for zero frames at the end."""
     if trajectory.frames is None:
         return
     told = BlankFrames(trajectory.frames).told or PADDING * _is_padded(trajectory.frames)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Answers of ``/gpu_status``, ``/health`` and ``/model_info``, from Triton's metrics, statistics and configuration."""
+"""Responses for ``/gpu_status``, ``/health``, ``/model_info``, from Triton's metrics, statistics and configuration."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from rfm_gateway import schema
 from rfm_gateway.config import GatewayConfig
 from rfm_gateway.observe import within
 
-HEALTH_TIMEOUT_S = 3.5  # of all probes; with HEALTH_KEPT_S less than the promised 5 s
-PROBE_TIMEOUT_S = 1.5  # of one probe; a slower model counts as busy
-HEALTH_KEPT_S = 1.0  # an answer is kept, since requests without a key must not load the models
+HEALTH_TIMEOUT_S = 3.5  # for all probes; with HEALTH_KEPT_S less than the promised 5 s
+PROBE_TIMEOUT_S = 1.5  # for one probe; a slower model counts as busy
+HEALTH_KEPT_S = 1.0  # responses are cached: requests without a key must not load the models
 STATUS_TIMEOUT_S = 5.0
 MS_PER_S = 1e3
 
 
-_REMEDIES = {  # for callers over HTTP, who have no option of the client
+_REMEDIES = {  # for callers over HTTP, who do not have the client's options
     AccessDeniedError: "whoever runs the gateway sets --triton-ca-file, --triton-certificate and --triton-key",
     ModelNotFoundError: "retry if the server restarts; else whoever runs the gateway names a served model with --model",
     ServerUnavailableError: "whoever runs the gateway starts Triton there (rfm serve does so by itself: retry), or "
@@ -48,9 +48,9 @@ def message_of(error: RewardError) -> str:
 
 
 class ServedParts:
-    """The parts of the checkpoint (embeddings, frames, encoder) that were served since the gateway began.
+    """The checkpoint's parts (embeddings, frames, encoder) that were served since the gateway began.
 
-    A part that is missing now is missing for a while: a server that restarts loads one model after another.
+    A part that is missing now is missing only for a while: a restarting server loads one model after another.
     """
 
     def __init__(self) -> None:
@@ -68,7 +68,7 @@ class ServedParts:
 
 
 class TritonState:
-    """The state of the client's checkpoint. parts: that must be served for ``/health``"""
+    """The state of the client's checkpoint. parts: must be served for ``/health``"""
 
     def __init__(self, client: AsyncRewardClient, config: GatewayConfig, parts: ServedParts) -> None:
         self._client = client
@@ -79,11 +79,11 @@ class TritonState:
         self._health: schema.Health | str = ""  # a text: the fault
 
     async def gpu_status(self) -> schema.GpuStatus:
-        """Return the answer of ``/gpu_status``. Raises ServerError."""
+        """Return the response for ``/gpu_status``. Raises ServerError."""
         return self._gpu_status(await self._config.status(STATUS_TIMEOUT_S))
 
     async def health(self) -> schema.Health:
-        """Return the answer of ``/health`` within HEALTH_TIMEOUT_S.
+        """Return the response for ``/health`` within HEALTH_TIMEOUT_S.
 
         Raises ServerUnavailableError if a model fails a probe.
         """
@@ -97,7 +97,7 @@ class TritonState:
         return found
 
     async def model_info(self) -> schema.ModelInformation:
-        """Return the answer of ``/model_info``. Raises ServerError."""
+        """Return the response for ``/model_info``. Raises ServerError."""
         info = (await within(STATUS_TIMEOUT_S, self._infos()))[0]
         devices = await self._devices(STATUS_TIMEOUT_S)
         parts, types = info.network.get("parameters", {}), info.network.get("types", {})
@@ -121,14 +121,14 @@ class TritonState:
         )
 
     async def _devices(self, timeout_s: float) -> schema.GpuStatus | None:
-        """Return the state of the devices; None if the metrics cannot be read, since scoring does not need them."""
+        """Return the devices' state; None if the metrics cannot be read, which scoring does not need."""
         try:
             return await within(timeout_s, self.gpu_status())
         except ServerError:
             return None
 
     async def _infos(self) -> list[ModelInfo]:
-        """Return facts about the models for embeddings and for raw frames. Raises ServerError, also for a lost one."""
+        """Return facts about the models for embeddings and for raw frames. Raises ServerError, also if one got lost."""
         infos = []
         for part in ("embeddings", "frames"):
             with self._parts.asking(part):
@@ -136,7 +136,7 @@ class TritonState:
         return infos or [await self._client.model_info(frames=True)]
 
     async def _probe_all(self) -> schema.Health | str:
-        """Probe every model. Returns a text with the reason if a model fails a probe."""
+        """Probe every model. Return a text with the reason if a model fails a probe."""
         ends_s = time.monotonic() + HEALTH_TIMEOUT_S
         try:
             await within(HEALTH_TIMEOUT_S, self._probe_models())
@@ -150,7 +150,7 @@ class TritonState:
         )
 
     async def _probe(self, info: ModelInfo) -> None:
-        """Probe a model. A late answer is no fault: the model may be busy. Raises RewardError."""
+        """Probe a model. A late response is no fault: the model may be busy. Raises RewardError."""
         with suppress(DeadlineExceededError):
             await self._client.probe(info, timeout_s=PROBE_TIMEOUT_S)
 
@@ -159,7 +159,7 @@ class TritonState:
 
     def _gpu_status(self, status: ServerStatus) -> schema.GpuStatus:
         names, served = self._client.model_names, {name for device in status.devices for name in device.work}
-        # An ensemble is left out, since its parts count its requests.
+        # An ensemble is left out: its parts count its requests.
         scorer = names["embeddings"] if names["embeddings"] in served else names["frames"]
         busy_s = {name: _busy_s(status, name) for name in (scorer, names["encoder"])}
         devices = [device for device in status.devices if busy_s.keys() & device.work.keys()] or list(status.devices)
@@ -190,7 +190,7 @@ class TritonState:
 
 
 def _busy_s(status: ServerStatus, model: str) -> dict[str, float]:
-    """Return the seconds that a model computed, by device: Triton's total, divided as the requests' time is."""
+    """Return how many seconds a model computed, by device: Triton's total, divided like the requests' time."""
     total_s = sum(entry.busy_ms for entry in status.models if entry.name == model) / MS_PER_S
     shares = {device.name: device.work[model].compute_s for device in status.devices if model in device.work}
     return {name: total_s * share / sum(shares.values()) for name, share in shares.items() if share}

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The page in the browser: reward curves of videos, datasets, running episodes. A gateway serves it."""
+"""The browser page: reward curves of videos, datasets, running episodes. A gateway serves it."""

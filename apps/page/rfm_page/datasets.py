@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """LeRobot and HDF5 datasets for the page, with or without labels. Needs pyarrow, and h5py for HDF5.
 
-T frames of an episode.
+T frames per episode.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _FILES_KNOWN = 64  # HDF5 files whose last check is remembered
 
 @dataclass(frozen=True)
 class ShownLeRobot(ShownDataset):
-    """A LeRobot dataset for the page. An episode is cut out of the stored video; pictures in tables are encoded."""
+    """A LeRobot dataset for the page. Episodes are cut out of stored videos; pictures in tables are encoded."""
 
     dataset: LeRobotDataset
 
@@ -38,17 +38,17 @@ class ShownLeRobot(ShownDataset):
 
     @property
     def cameras(self) -> Sequence[str]:
-        """The cameras with videos, and those with pictures in colours."""
+        """The cameras with videos, and those with colour pictures."""
         unused, videos = self.dataset.unused_cameras(self.dataset.cameras), self.dataset.info.videos
         return [camera for camera in self.dataset.cameras if camera in videos or camera not in unused]
 
     @property
     def fps(self) -> float:
-        """Frames a second, as ``meta/info.json`` says."""
+        """Frames per second, from ``meta/info.json``."""
         return self.dataset.info.fps
 
     def times_s(self, episode: DatasetEpisode) -> npt.NDArray[np.float64]:
-        """Return float64 [T], the times of the episode's rows. Raises DatasetError."""
+        """Return float64 [T], the times in the episode's rows. Raises DatasetError."""
         return self.dataset.times_s(episode)
 
     def mp4(self, episode: DatasetEpisode, camera: str, take: Callable[[int], object]) -> bytes:
@@ -59,7 +59,7 @@ class ShownLeRobot(ShownDataset):
 
 
 def _cut(span: Span, take: Callable[[int], object]) -> bytes:
-    """Return a span of a video as an MP4 file that begins at 0 s. Packets are copied, so frames stay equal.
+    """Return a span of a video as an MP4 file that begins at 0 s. Packets are copied, so frames stay identical.
 
     The file also holds earlier frames that decoding needs, marked so that players skip them.
     """
@@ -87,7 +87,7 @@ def _begin_s(span: Span) -> float:
 
 
 def _packets(video: Any, stream: Any, span: Span, take: Callable[[int], object]) -> list[Any]:
-    """Return the packets that decoding an episode needs, in the order of decoding."""
+    """Return the packets needed to decode an episode, in decoding order."""
     begin_s, end_s = _begin_s(span), float(span.times_s[-1]) + span.tolerance_s
     video.seek(max(round(begin_s / stream.time_base), 0), stream=stream)
     packets: list[Any] = []
@@ -103,7 +103,7 @@ def _packets(video: Any, stream: Any, span: Span, take: Callable[[int], object])
     shown_s = [float(packet.pts * stream.time_base) for packet in packets]
     while shown_s and shown_s[-1] > end_s:
         del packets[-1], shown_s[-1]
-    num_shown = len(set(shown_s).intersection(span.times_s.tolist()))  # others between them belong to no row
+    num_shown = len(set(shown_s).intersection(span.times_s.tolist()))  # other frames between them belong to no row
     if num_shown != len(span.times_s) or not packets[0].is_keyframe:
         raise span.error(f"{len(span.times_s)} frames from {span.times_s[0]:.4f} s on", f"{num_shown}")
     if max(shown_s) > end_s:
@@ -118,7 +118,7 @@ def _packets(video: Any, stream: Any, span: Span, take: Callable[[int], object])
 class ShownHdf5(ShownDataset):
     """An HDF5 dataset for the page.
 
-    A file with links to other files, or with data in them, is refused, since its author could show files of this
+    Refuses a file that links to other files or stores data in them: its author could show files from this
     machine.
     """
 
@@ -126,27 +126,27 @@ class ShownHdf5(ShownDataset):
 
     @property
     def path(self) -> Path:
-        """The file of the dataset."""
+        """The single file that holds the dataset."""
         return self.dataset.file
 
     def check(self) -> None:
-        """Raise DatasetError for data in other files, in the dataset or its labels."""
+        """Raise DatasetError if the dataset or its labels keep data in other files."""
         check_links(self.root, [self.path, *find_label_files(self.path)])
         _check_inside(self.path, _changed_ns(self.path))
 
     @property
     def cameras(self) -> Sequence[str]:
-        """The cameras that are labelled without a choice."""
+        """The cameras that are labelled by default."""
         return self.dataset.chosen_cameras()
 
     @property
     def fps(self) -> float:
-        """Frames a second: robosuite's control frequency, else its default."""
+        """Frames per second: robosuite's control frequency, else its default."""
         return self.dataset.fps
 
 
 def _changed_ns(file: Path) -> int:
-    """The time of a file's last change, which its author cannot set. Raises DatasetError."""
+    """Return when a file last changed, a time that its author cannot set. Raises DatasetError."""
     try:
         return file.stat().st_ctime_ns
     except OSError as error:

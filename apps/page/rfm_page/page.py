@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Add the page to the gateway that serves it: entry point ``rfm_gateway.page``.
 
-A request about a dataset names it, an episode and a camera by number, and labels by a name from an earlier answer.
+A request about a dataset names the dataset, episode and camera by number, and labels by a name from an earlier
+response.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def add_page(host: PageHost) -> None:
 
 
 def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
-    """Return the datasets that the page shows. Raises ConfigError for a folder without such a dataset."""
+    """Return the datasets that the page shows. Raises ConfigError for a folder without a dataset that it can show."""
     if not config.dataset:
         return []
     try:
@@ -63,7 +64,7 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
 
 
 def dataset_routes(datasets: Sequence[ShownDataset], limits: BodyLimits) -> APIRouter:
-    """Return the endpoints of the page's datasets. The evaluation server has no such endpoints."""
+    """Return the endpoints for the page's datasets. The evaluation server has no such endpoints."""
     router = APIRouter(include_in_schema=False)
 
     async def read(request: Request, number: int, reading: Callable[[ShownDataset], Read]) -> Read:
@@ -109,5 +110,5 @@ def dataset_routes(datasets: Sequence[ShownDataset], limits: BodyLimits) -> APIR
 
 
 def _json(document: dict[str, Any]) -> Response:
-    """Return an answer in JSON, with null for NaN, which JSON does not have."""
+    """Return a JSON response, with null for NaN, which JSON does not have."""
     return Response(to_json(document, inf_nan_mode="null"), media_type="application/json")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The page's requests about videos: form fields, and frames of uploaded videos.
+"""The page's requests about videos: form fields, and frames from uploaded videos.
 
-Uploads are not trusted. Their first bytes choose one of a few formats. FFmpeg does not choose, because it would open
-the files and addresses that a play list or a session description names.
+Uploads are not trusted. Their first bytes select one of a few formats. FFmpeg must not select, because it would open
+the files and addresses that a playlist or a session description names.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from rfm_client.frames import ChannelOrder, Correction, Orientation, Rule, Sampl
 from rfm_client.options import InvalidValueError
 from rfm_gateway.mounting import field_errors, invalid
 
-DEFAULT_FPS = 3.0  # the default of rfm-client score
-MOST_FRAMES = 4096  # of a prefix: more than any checkpoint takes
+DEFAULT_FPS = 3.0  # the default in rfm-client score
+MOST_FRAMES = 4096  # in a prefix: more than any checkpoint takes
 KINDS = "MP4, MOV, WebM, Matroska, Ogg or AVI"
 
 _BEGINNING_BYTES = 12
@@ -73,7 +73,7 @@ class VideoRequest(BaseModel):
     def sampling(self, info: ModelInfo) -> Sampling:
         """Return the sampling.
 
-        Raises RequestValidationError for a number of frames that the rule does not take, and for a rule with a
+        Raises RequestValidationError for a frame count that the rule does not accept, and for a rule with a
         checkpoint that needs the whole episode.
         """
         rule = "all" if info.needs_whole_episode and self.rule is None else self.rule
@@ -85,9 +85,9 @@ class VideoRequest(BaseModel):
             raise invalid((error.where,), error.problem) from None
 
     async def video(self, uploads: Mapping[str, UploadFile], name: str, take: Callable[[int], object]) -> ShownVideo:
-        """Read the uploaded video of this name. Raises RequestValidationError, and what ``take`` raises.
+        """Read the uploaded video with this name. Raises RequestValidationError, and what ``take`` raises.
 
-        take: called with the size of frames before they are decoded
+        take: called with the frames' size in bytes before they are decoded
         """
         if name not in uploads:
             raise invalid((name,), "expected a video file, got none")
@@ -117,7 +117,7 @@ class VideoRequest(BaseModel):
 
 
 def _container(beginning: bytes) -> str | None:
-    """Return FFmpeg's name of the format, by a video's first bytes; None: none of KINDS."""
+    """Return FFmpeg's format name, from a video's first bytes; None: not in KINDS."""
     if beginning[4:8] in _MP4_BOXES:
         return "mov"
     if beginning.startswith(_EBML):

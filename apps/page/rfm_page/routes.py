@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The page's endpoints for videos: served models, the curve of a video, the comparison of two videos.
+"""The page's endpoints for videos: served models, a video's curve, the comparison between two videos.
 
 A curve comes as server-sent events: ``video`` has its frames, ``scores`` some points, ``done`` or ``failed`` ends it.
 Each frame is scored on its prefix, a few prefixes at a time.
@@ -43,7 +43,7 @@ from rfm_gateway.mounting import GatewayConfig, PageHost, invalid, while_connect
 from rfm_page.questions import DEFAULT_FPS, ShownVideo, VideoRequest
 
 MOST_PREFIXES = 32  # in a request
-MOST_BYTES = 64 * 2**20  # of the frames in a request
+MOST_BYTES = 64 * 2**20  # for all frames in a request
 STATUS_TIMEOUT_S = 5.0
 _AS_THEY_COME = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}  # the second tells proxies not to buffer
 
@@ -56,14 +56,14 @@ _SCORES: dict[str, dict[str, Any]] = {  # what the page's axes need
     }
     for name, score in _INSTEAD.items()
 }
-_REPOSITORY, _CHECKPOINT, _DATASET = "my_models", "my_checkpoint", "my_dataset"  # stand for paths of the user
+_REPOSITORY, _CHECKPOINT, _DATASET = "my_models", "my_checkpoint", "my_dataset"  # placeholders for the user's paths
 
 logger = logging.getLogger("rfm_gateway")
 
 
 @dataclass(frozen=True)
 class _Asked:
-    """A request with its model and its videos."""
+    """A request with its model and videos."""
 
     question: VideoRequest
     sampling: Sampling
@@ -103,7 +103,7 @@ def viewer_routes(host: PageHost) -> APIRouter:
         return JSONResponse(answer)
 
     async def read(request: Request, *names: str) -> _Asked:
-        """Read a request with the videos of these names.
+        """Read a request with the videos under these names.
 
         Raises RequestValidationError, HTTPException and RewardError.
         """
@@ -123,7 +123,7 @@ def viewer_routes(host: PageHost) -> APIRouter:
         raise invalid((names[0],), f"expected videos that are read within {config.timeout_s:g} s, got longer ones")
 
     async def events(asked: _Asked) -> AsyncIterator[str]:
-        """Yield the events of a curve. An error is the last event, since the status has been sent already."""
+        """Yield a curve's events. An error is the last event, because the status has already been sent."""
         (video,) = asked.videos
         num_frames, began_s, version = video.trajectory.num_frames, time.monotonic(), None
         times_s = None if video.times_s is None else video.times_s.tolist()
@@ -152,7 +152,7 @@ def viewer_routes(host: PageHost) -> APIRouter:
 
 
 async def _infos(config: GatewayConfig) -> list[tuple[str, ModelInfo]]:
-    """Return the served models for raw frames, by the name of their export. Raises RewardError."""
+    """Return the served models for raw frames, by export name. Raises RewardError."""
     infos = []
     for name in (await config.status(STATUS_TIMEOUT_S)).checkpoints:
         try:
@@ -172,7 +172,7 @@ def _told_of(name: str, info: ModelInfo) -> dict[str, Any]:
 
 
 def _frames_of(rule: Rule) -> int | str | None:
-    """Return a rule's own number of frames, "any" if the caller chooses it, None if the rule has no such number."""
+    """Return a rule's own frame count, "any" if the caller chooses it, None if the rule has no such count."""
     try:
         return Sampling(rule).frames
     except ValueError:
@@ -205,7 +205,7 @@ async def _curve(client: AsyncRewardClient, trajectory: Trajectory, asked: _Aske
 
 
 def _points(first: int, parts: Sequence[ProgressResult]) -> dict[str, Any]:
-    """Return the points of a curve from frame ``first`` on. Raises InferenceFailedError for several versions."""
+    """Return a curve's points from frame ``first`` on. Raises InferenceFailedError for several versions."""
     points = ProgressResult.of_parts(parts)
     return {
         "first": first,
@@ -243,10 +243,10 @@ def _event(name: str, **document: Any) -> str:
 
 
 def _remedies(config: GatewayConfig, started_by: str) -> dict[str, str | bool]:
-    """Return a command line for each fault, with the options of the command that started the page.
+    """Return a command line for each fault, with the options that the page was started with.
 
     start: the server has ended
-    dataset: no dataset is there
+    dataset: there is no dataset
     triton: Triton does not answer
     model: Triton serves no model
     starts_triton: True: ``start`` also starts Triton

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A dataset for the page: what its episodes and their labels tell, whatever its kind.
+"""A dataset of any kind for the page: its episodes and their labels.
 
-Needs pyarrow. T frames of an episode.
+Needs pyarrow. T frames per episode.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from rfm_labels import (
 Read = TypeVar("Read")
 
 _SUMMARIES_AT_A_TIME = 8  # summaries in memory
-_POINTS = 32  # of a preview's curve
-_CODING = {"crf": "12", "g": "10", "preset": "veryfast"}  # of H.264: hardly any loss, and quick to move in
-_PREVIEW_PX = (96, 72)  # width and height, at most
+_POINTS = 32  # in a preview's curve
+_CODING = {"crf": "12", "g": "10", "preset": "veryfast"}  # for H.264: hardly any loss, and fast seeking
+_PREVIEW_PX = (96, 72)  # maximum width and height
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class ShownDataset:
     """A dataset for the page, whose pictures are encoded as videos; without a subclass, an RLDS dataset.
 
     dataset: as ``open_to_show`` returns it
-    Its methods raise DatasetError for a broken dataset, HTTPException 404 for a missing episode, camera or label file.
+    Methods raise DatasetError for a broken dataset, HTTPException 404 for a missing episode, camera or label file.
     """
 
     dataset: Dataset
@@ -67,7 +67,7 @@ class ShownDataset:
         return self.root
 
     def check(self) -> None:
-        """Raise DatasetError if the dataset would show other files of this machine. Before every reading."""
+        """Raise DatasetError if the dataset would show other files from this machine. Called before every read."""
         check_links(self.root, links_in(self.root))
 
     @property
@@ -82,15 +82,15 @@ class ShownDataset:
 
     @property
     def fps(self) -> float:
-        """Frames a second of the videos. An RLDS dataset does not say."""
+        """Video frames per second. An RLDS dataset does not say."""
         return 10.0
 
     def times_s(self, episode: DatasetEpisode) -> npt.NDArray[np.float64]:
-        """Return float64 [T], the time of each frame; at equal distances in a dataset without times."""
+        """Return float64 [T], each frame's time; evenly spaced in a dataset without times."""
         return np.arange(episode.num_frames) / self.fps
 
     def mp4(self, episode: DatasetEpisode, camera: str, take: Callable[[int], object]) -> bytes:
-        """Return an episode's video as an MP4 file. take: as of ``video``"""
+        """Return an episode's video as an MP4 file. take: see ``video``"""
         return encoded(self.dataset.stored_frames(episode, camera), self.fps, take)
 
     def read(self, reading: Callable[[ShownDataset], Read]) -> Read:
@@ -103,7 +103,7 @@ class ShownDataset:
 
     @property
     def about(self) -> dict[str, Any]:
-        """The dataset's name and kind, and the names of its label files."""
+        """The dataset's name and kind, and its label files' names."""
         names = [self._name_of(file) for file in find_label_files(self.path)]
         return {"name": self.dataset.source, "kind": self.dataset.kind, "labels": names}
 
@@ -141,7 +141,7 @@ class ShownDataset:
         }
 
     def faults(self) -> dict[str, str]:
-        """Return the fault of each episode that cannot be labelled now, by number, as ``rfm-client label`` tells it."""
+        """Return why episodes cannot be labelled now, by episode number, as ``rfm-client label`` reports it."""
         found = {}
         unused = self.dataset.unused_cameras(self.cameras)
         cameras = [camera for camera in self.cameras if camera not in unused]
@@ -169,7 +169,7 @@ class ShownDataset:
         }
 
     def video(self, number: int, camera: int, take: Callable[[int], object]) -> bytes:
-        """Return an episode's video as an MP4 file. take: called with a number of bytes before they are allocated"""
+        """Return an episode's video as an MP4 file. take: called with a byte count before the bytes are allocated"""
         if not 0 <= camera < len(self.cameras):
             raise HTTPException(404, f"camera: expected one of {len(self.cameras)} with videos, got {camera}")
         return self.mp4(self._episode(number), self.cameras[camera], take)
@@ -177,7 +177,7 @@ class ShownDataset:
     def preview(self, number: int, labels: str | None, take: Callable[[int], object]) -> dict[str, Any]:
         """Return an episode's progress at a few points, and its first frame as JPEG in base64; null: it cannot be read.
 
-        take: as of ``video``
+        take: see ``video``
         """
         episode, file = self._episode(number), self._labels(labels)
         found = None if file is None else read_episode_labels(file, number)
@@ -189,7 +189,7 @@ class ShownDataset:
         camera = next((each for each in self.cameras if each not in unused), None)
         try:
             picture = None if camera is None else self._picture(episode, file, camera, take)
-        except DatasetError:  # the list of faults tells it
+        except DatasetError:  # the list of faults reports it
             picture = None
         return {"progress": [] if progress is None else progress.tolist(), "picture": picture}
 
@@ -219,7 +219,7 @@ class ShownDataset:
         return self.dataset.episode(number)
 
     def _labels(self, name: str | None) -> Path | None:
-        """Return the label file of this name, by default the first; None: no labels."""
+        """Return the label file with this name, by default the first; None: no labels."""
         files = {self._name_of(file): file for file in find_label_files(self.path)}
         if name is None:
             name = next(iter(files), None)
@@ -228,11 +228,11 @@ class ShownDataset:
         return None if name is None else files[name]
 
     def _correction(self, file: Path | None, camera: str) -> Correction:
-        """Return how the camera's frames became upright RGB for these labels; without labels, how they do now."""
+        """Return how these labels made the camera's frames upright RGB; without labels, how the dataset does now."""
         if file is None:
             return self.dataset.corrections.get(camera, Correction())
         told = read_provenance(file)
-        orient = told.get("orientations", {}).get(camera)  # labels of version 0.1.0 have none
+        orient = told.get("orientations", {}).get(camera)  # labels from version 0.1.0 have none
         order = told.get("channels", {}).get(camera)
         is_known = orient in get_args(Orientation), order in get_args(ChannelOrder)
         return Correction(orient if is_known[0] else "none", order if is_known[1] else "rgb")
@@ -247,7 +247,7 @@ def _summary(file: Path, _changed_ns: int) -> Summary:
 
 
 def _rows(summary: Summary) -> list[dict[str, Any]]:
-    """Return a row of the summary for each episode."""
+    """Return the summary's rows, one per episode."""
     columns: dict[str, Sequence[Any]] = {
         "final_progress": summary.final_progress.tolist(),
         "backwards": summary.backwards.tolist(),
@@ -263,7 +263,7 @@ def _curves(labels: EpisodeLabels, num_frames: int) -> list[dict[str, Any]]:
     curves = [(None, labels.fused), *labels.cameras.items()]
     answered = np.ones(num_frames, bool)
     answered[labels.frames] = labels.is_answered
-    told = {"answered": answered.tolist()}  # False: the model skipped the frame; True, too: a frame without labels
+    told = {"answered": answered.tolist()}  # False: the model skipped the frame; also True for a frame without labels
     return [{"camera": camera, **_scores(curve, labels.frames, num_frames), **told} for camera, curve in curves]
 
 
@@ -280,10 +280,10 @@ def _scores(curve: Curve, frames: npt.NDArray[np.int64], num_frames: int) -> dic
 
 
 def encoded(frames: Iterator[UInt8Array], fps: float, take: Callable[[int], object]) -> bytes:
-    """Return pictures as an MP4 file of nearly the same colours.
+    """Return pictures as an MP4 file with nearly the same colours.
 
     frames: uint8 [H, W, 3] each
-    take: called with a number of bytes before they are allocated
+    take: called with a byte count before the bytes are allocated
     """
     video = io.BytesIO()
     with av.open(video, "w", format="mp4") as container:
@@ -308,7 +308,7 @@ def _mux(container: Any, packets: Sequence[Any], take: Callable[[int], object]) 
 def links_in(folder: Path) -> Iterator[Path]:
     """Yield all links below a folder; 100,000 files take 0.1 s.
 
-    Raises DatasetError for a folder that hides them, and for pipes, sockets and devices, which reading would wait for.
+    Raises DatasetError for a folder that hides them, and for pipes, sockets and devices, on which reading would block.
     """
     if not os.access(folder, os.X_OK):  # nothing in it can be opened
         return
@@ -329,7 +329,7 @@ def links_in(folder: Path) -> Iterator[Path]:
 def check_links(root: Path, paths: Iterable[Path]) -> None:
     """Raise DatasetError for a path whose file is not in ``root``, a folder with links resolved.
 
-    The dataset's author could show other files of this machine.
+    Otherwise the dataset's author could show other files from this machine.
     """
     for path in paths:
         try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A reward model for LeRobot whose scores come from a served checkpoint. Importing it registers the type ``rfm``."""
+"""A LeRobot reward model whose scores come from a served checkpoint. Importing it registers the type ``rfm``."""
 
 from lerobot_reward_rfm.configuration_rfm import RfmRewardConfig
 from lerobot_reward_rfm.modeling_rfm import RfmPrediction, RfmRewardModel

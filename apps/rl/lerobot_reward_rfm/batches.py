@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From a batch of LeRobot to trajectories: images to uint8, tasks, padding."""
+"""Convert a LeRobot batch to trajectories: images to uint8, tasks, padding."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ IMAGES = "images [B, 3, H, W], one frame a sample, or [B, T, 3, H, W]"
 
 
 def trajectories_of(batch: Mapping[str, Any], config: RfmRewardConfig) -> list[Trajectory]:
-    """Return the trajectory of each sample: the frames that are no padding, uint8 [T, H, W, 3], and the task.
+    """Return each sample's trajectory: the frames without padding, uint8 [T, H, W, 3], and the task.
 
     Raises InvalidSampleError for images, tasks or padding that do not fit.
     """
@@ -33,7 +33,7 @@ def trajectories_of(batch: Mapping[str, Any], config: RfmRewardConfig) -> list[T
 def trajectory_of(
     images: Any, task: str, pad: npt.NDArray[np.bool_] | None, config: RfmRewardConfig, index: int
 ) -> Trajectory:
-    """Return one sample's trajectory. images: [T, 3, H, W] or [T, H, W, 3]. index: of the sample, for errors"""
+    """Return one sample's trajectory. images: [T, 3, H, W] or [T, H, W, 3]. index: the sample's, for errors"""
     step = {config.image_key: images} if pad is None else {config.image_key: images, f"{config.image_key}_is_pad": pad}
     try:
         trajectory = as_trajectory(step, task=task)
@@ -46,7 +46,7 @@ def trajectory_of(
 
 
 def images_of(batch: Mapping[str, Any], key: str) -> Any:
-    """Return the batch's images of the camera, [B, T, ...]. Raises InvalidSampleError."""
+    """Return the camera's images from the batch, [B, T, ...]. Raises InvalidSampleError."""
     keys = ", ".join(sorted(name for name in batch if str(name).startswith("observation.image"))) or "none"
     require("batch", key in batch, f"images under {key!r} (the configuration's image_key)", keys, InvalidSampleError)
     images = batch[key]

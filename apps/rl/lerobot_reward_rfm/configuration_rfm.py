@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The configuration of the reward model: the server, the frames of a batch, the reward."""
+"""The reward model's configuration: the server, the frames in a batch, the reward."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ OUTPUTS = ("progress", "success", "remaining_s")
 @RewardModelConfig.register_subclass("rfm")
 @dataclass
 class RfmRewardConfig(RewardModelConfig):
-    """Settings of a served reward model. Raises ValueError for a value that cannot be meant.
+    """Settings for a served reward model. Raises ValueError for invalid values.
 
     device: where LeRobot's preprocessor puts a batch; the network runs on the server
-    url: address of the server, ``grpc://host:8001`` or ``http://host:8000``, with TLS ``grpcs://`` or ``https://``;
-        of several servers, the addresses separated by spaces
+    url: server address, ``grpc://host:8001`` or ``http://host:8000``, with TLS ``grpcs://`` or ``https://``; for
+        several servers, the addresses separated by spaces
     model: name under which the checkpoint was exported
-    timeout_s: longest time of a call, retries included
+    timeout_s: longest time for a call, retries included
     ca_file, client_certificate, client_key: as in ``RewardClient``
     api_key_file: file with the server's key. The key itself never enters the configuration, which LeRobot publishes
-    image_key: key of the camera to score, ``observation.image`` or ``observation.images.<camera>``
-    default_task: the task of batches without one
+    image_key: the camera to score, ``observation.image`` or ``observation.images.<camera>``
+    default_task: task for batches without one
     sampling, frames: as in ``client.episode``; None: as the checkpoint was trained
     orient: rotation or flip that makes the camera's frames upright
-    resize: True: shrink frames to the checkpoint's size before they travel (needs Pillow)
-    reward_output: the reward of ``compute_reward``: ``progress``, 0 to 1, ``success``, 1.0 or 0.0, or ``remaining_s``,
-        minus the remaining seconds
-    success_threshold: least probability of a ``success``
+    resize: True: shrink frames to the checkpoint's input size before sending (needs Pillow)
+    reward_output: the reward from ``compute_reward``: ``progress``, 0 to 1, ``success``, 1.0 or 0.0, or
+        ``remaining_s``, minus the remaining seconds
+    success_threshold: lowest probability that counts as ``success``
     """
 
     device: str | None = "cpu"
@@ -75,11 +75,11 @@ class RfmRewardConfig(RewardModelConfig):
 
     @property
     def correction(self) -> Correction:
-        """How the camera's frames become upright."""
+        """How to make the camera's frames upright."""
         return Correction(self.orient)  # type: ignore[arg-type]  # checked above; LeRobot's parser knows no Literal
 
     def connect(self) -> RewardClient:
-        """Return a client of the server. Raises ValueError for options that contradict, OSError for a missing file."""
+        """Return a client for the server. Raises ValueError for contradictory options, OSError for a missing file."""
         key = None if self.api_key_file is None else Path(self.api_key_file).read_text().strip()
         return RewardClient(
             self.url.split(),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The reward model without weights: it asks a server."""
+"""The reward model without weights: a server computes the rewards."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from rfm_client import (
 from rfm_client.frames import Sampling
 from rfm_client.options import require
 
-AT_A_TIME = 32  # samples: each copies its frames, so that those of all prefixes of an episode would fill memory
+AT_A_TIME = 32  # samples: each copies its frames, so all prefixes of an episode at once would fill memory
 
 
 @dataclass(frozen=True)
 class RfmPrediction:
-    """Scores of the frames of a batch.
+    """Scores for the frames in a batch.
 
     progress: float32 [B, T], 0 to 1
     success_probability: float32 [B, T]; None: the checkpoint does not predict success
@@ -44,15 +44,15 @@ class RfmPrediction:
 
 
 class RfmRewardModel(PreTrainedRewardModel):
-    """A reward model of LeRobot whose network runs on a server. Its saved form is a configuration.
+    """A LeRobot reward model whose network runs on a server. Only a configuration is saved.
 
-    client: a client of yours, which the model never closes; None: the model makes one at its first call, and so does
-        each copy of the model
+    client: your client, which the model never closes; None: the model makes one at its first call, and so does each
+        copy of the model
 
     A batch has images under the configuration's ``image_key``: uint8, or float in 0..1, [B, T, 3, H, W], the newest
-    frame last, or [B, 3, H, W], which is one frame a sample; on any device. ``task`` is a sentence, or one a sample.
-    Frames that LeRobot marks as padding (``<image_key>_is_pad``) repeat a neighbour: no network sees them, and they
-    get the neighbour's score.
+    frame last, or [B, 3, H, W], one frame per sample; on any device. ``task`` is one sentence, or one per sample.
+    Frames that LeRobot marks as padding (``<image_key>_is_pad``) repeat a neighbour: the network never sees them, and
+    they get the neighbour's score.
     """
 
     config_class = RfmRewardConfig
@@ -65,7 +65,7 @@ class RfmRewardModel(PreTrainedRewardModel):
 
     @property
     def client(self) -> RewardClient:
-        """The client that asks the server."""
+        """The client that talks to the server."""
         if self._given is not None:
             return self._given
         made = self._made
@@ -88,9 +88,9 @@ class RfmRewardModel(PreTrainedRewardModel):
         return {**self.__dict__, "_made": None}
 
     def compute_reward(self, batch: Mapping[str, Any]) -> Tensor:
-        """Return the reward of each sample at its newest frame, float32 [B], on the device of the images.
+        """Return each sample's reward at the newest frame, float32 [B], on the images' device.
 
-        It is the reward of the Gymnasium wrappers and of labels for the same frames. Raises RewardError, never a
+        The Gymnasium wrappers and labels give the same reward for the same frames. Raises RewardError, never returns a
         number instead; ValueError for a ``reward_output`` that the checkpoint does not predict.
         """
         newest = newest_scores(self.client, trajectories_of(batch, self.config), self.config)
@@ -105,7 +105,7 @@ class RfmRewardModel(PreTrainedRewardModel):
         return self._tensor(batch, -scores if output == "remaining_s" else scores)
 
     def predict_progress(self, batch: Mapping[str, Any]) -> RfmPrediction:
-        """Return the scores of all frames, each on the frames up to it alone, so the last is ``compute_reward``'s.
+        """Return scores for all frames. No score uses later frames, so the last equals ``compute_reward``'s.
 
         The server scores B times T samples. Raises RewardError.
         """
@@ -127,7 +127,7 @@ RfmRewardRewardModel = RfmRewardModel  # the name that LeRobot derives from RfmR
 
 
 def spread(scores: Sequence[Float32Array], pads: npt.NDArray[np.bool_] | None) -> Float32Array:
-    """Return float32 [B, T] of the scores of real frames: padding gets the score of the frame that it repeats."""
+    """Return float32 [B, T] from the scores of real frames: padding gets the score of the frame that it repeats."""
     if pads is None:
         return np.stack(scores)
     real = np.maximum(np.cumsum(~pads, axis=1) - 1, 0)
@@ -135,7 +135,7 @@ def spread(scores: Sequence[Float32Array], pads: npt.NDArray[np.bool_] | None) -
 
 
 def rule_of(info: ModelInfo, config: RfmRewardConfig) -> Sampling:
-    """Return the sampling rule. Raises ValueError without a number that it needs.
+    """Return the sampling rule. Raises ValueError if the rule needs a number and has none.
 
     Raises InvalidSampleError for a checkpoint that cannot score while an episode runs.
     """
@@ -147,7 +147,7 @@ def rule_of(info: ModelInfo, config: RfmRewardConfig) -> Sampling:
 def newest_scores(
     client: RewardClient, trajectories: Sequence[Trajectory], config: RfmRewardConfig
 ) -> list[ProgressResult]:
-    """Return the scores of the newest frame of each trajectory, [1], from few requests. Raises RewardError."""
+    """Return the newest frame's scores for each trajectory, [1], from few requests. Raises RewardError."""
     rule = rule_of(client.model_info(frames=True), config)
     prefixes = [rule.prefix(trajectory.num_frames - 1) for trajectory in trajectories]
     samples = [
@@ -164,9 +164,9 @@ def newest_scores(
 def scores_of_all_frames(
     client: RewardClient, trajectories: Sequence[Trajectory], config: RfmRewardConfig
 ) -> list[ProgressResult]:
-    """Return the scores of every frame of each trajectory, [T], as ``newest_scores`` would at that frame.
+    """Return scores for every frame of each trajectory, [T], as ``newest_scores`` would at that frame.
 
-    Costs a sample for each frame. Raises RewardError.
+    Costs one sample per frame. Raises RewardError.
     """
     rule = rule_of(client.model_info(frames=True), config)
     results = iter(evaluated(client, chain.from_iterable(map(rule.samples, trajectories)), config))
@@ -178,7 +178,7 @@ def scores_of_all_frames(
 
 
 def evaluated(client: RewardClient, samples: Iterable[ProgressSample], config: RfmRewardConfig) -> list[ProgressResult]:
-    """Return the results of samples, in order, with the frames of a few samples in memory. Raises RewardError."""
+    """Return results in sample order, with the frames of only a few samples in memory. Raises RewardError."""
     waiting, results = iter(samples), list[ProgressResult]()
     while some := list(islice(waiting, AT_A_TIME)):
         results += cast(list[ProgressResult], client.evaluate(some, resize=config.resize))

@@ -18,9 +18,9 @@ from lerobot_reward_rfm.configuration_rfm import RfmRewardConfig
 
 
 def make_rfm_pre_post_processors(config: RfmRewardConfig, dataset_stats: Any = None) -> tuple[Any, Any]:
-    """Return the pipelines that LeRobot asks for by this name.
+    """Return the pipelines that LeRobot requests by this name.
 
-    The first adds a missing batch dimension and leaves pixels alone, because the server normalizes them. The second
+    The first adds a missing batch dimension and leaves pixels alone, because the server normalises them. The second
     changes nothing.
 
     dataset_stats: not used

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rewards of a served reward model in reinforcement learning: Gymnasium environments and vectors."""
+"""Rewards from a served reward model in reinforcement learning: Gymnasium environments and vectors."""
 
 from rfm_client.episodes import SuccessRule
 from rfm_rl.gym import RewardModelWrapper

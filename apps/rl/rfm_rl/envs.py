@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The episodes of environments side by side, on which each wrapper stands. ``gym.py`` states the rules."""
+"""Episodes of parallel environments, the basis of every wrapper. ``gym.py`` states the rules."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rfm_rl.rewards import RewardedEpisode, RewardOptions
 
 ClientSource: TypeAlias = RewardClient | Callable[[], RewardClient]
 Mask: TypeAlias = npt.NDArray[np.bool_]
-Frames: TypeAlias = Callable[[int], Any]  # from the number of an environment to its frame, or frames by camera
+Frames: TypeAlias = Callable[[int], Any]  # from an environment's number to its frame, or frames by camera
 
 INFO = "reward_model"  # key in info
 _LOST = "an earlier call failed before its frame was kept"
@@ -30,14 +30,14 @@ logger = logging.getLogger("rfm_client")
 
 
 class RewardedEnvs:
-    """The running episodes of environments, whose newest frames one request scores. Connects at the first request.
+    """Running episodes of several environments; one request scores all newest frames. Connects at the first request.
 
     A wrapper calls ``check_reset``, resets its environments, and calls ``begin``; or calls ``check_step``, steps them,
     and calls ``keep``. After an error between the two, the environments need a reset.
 
-    tasks: the task sentence of each environment's next episode
-    final: name in errors of the last frame of an episode whose environment has reset in the same step
-    remedy: of a step that needs a reset
+    tasks: task sentence for each environment's next episode
+    final: what errors call an episode's last frame if the environment has reset in the same step
+    remedy: for a step that needs a reset
     returns_copies: True: no environment draws over a frame that it has returned
     is_only: True: errors do not name the environment
     """
@@ -58,15 +58,15 @@ class RewardedEnvs:
             raise TypeError(f"client: expected a RewardClient or a function that makes one, got {got}")
         self.tasks = tasks
         self.episodes: dict[int, RewardedEpisode] = {}
-        self.ended: Mask = np.zeros(len(tasks), np.bool_)  # a step of them would follow the end of their episode
+        self.ended: Mask = np.zeros(len(tasks), np.bool_)  # a step would follow the end of their episode
         self._whole: Mask = np.zeros(len(tasks), np.bool_)  # all frames of the episode are kept
-        self._kept: Mask = self._whole  # those that stay whole in the reset that runs
-        self._resetting: Mask = self.ended  # in the reset or step that runs
+        self._kept: Mask = self._whole  # those that stay whole in the current reset
+        self._resetting: Mask = self.ended  # in the current reset or step
         self._source, self._options = client, options
         self._remedy, self._final, self._is_only = remedy, final, is_only
-        self._returning_copies = set(range(len(tasks))) if returns_copies else set()  # of environments
+        self._returning_copies = set(range(len(tasks))) if returns_copies else set()  # environments by number
         self._made: RewardClient | None = None
-        self._has_dropped = False  # the last reset has, and no episode has ended since
+        self._has_dropped = False  # the last reset dropped a reward, and no episode has ended since
         self._has_warned = False
 
     @property
@@ -75,7 +75,7 @@ class RewardedEnvs:
         return np.array([episode.succeeded for _, episode in sorted(self.episodes.items())], np.bool_)
 
     def check_reset(self, mask: Mask) -> None:
-        """Warn once of a reset that drops the reward of unended episodes. Call it before the reset.
+        """Warn once if a reset drops the reward of unended episodes. Call this before the reset.
 
         Raises ValueError in mode ``final`` for the second such reset in a row: episodes that end outside the wrapper
         would never be paid. An end or an error between the resets allows the second.
@@ -119,9 +119,9 @@ class RewardedEnvs:
         *,
         final: Frames | None = None,
     ) -> tuple[npt.NDArray[np.float64], dict[int, RewardedEpisode]]:
-        """Add the frames of a step, and score what is due. Raises RewardError.
+        """Add the frames after a step, and score what is due. Raises RewardError.
 
-        Each frame is kept as soon as it is made: it may reuse the array of the frame before.
+        A frame is kept as soon as it is made, because the next may reuse its array.
 
         shown: the frames after the step
         final: the last frames of episodes whose environments have reset in this step; None: they have not
@@ -164,7 +164,7 @@ class RewardedEnvs:
             logger.warning("%s: expected the end of the episode before it, got %s; %s", where, got, _INSIDE)
 
     def _begin(self, mask: Mask, first: Frames, last: Mapping[int, Any]) -> list[RewardedEpisode]:
-        """Begin an episode of each environment in the mask. last: copies of the last frames of the episodes before."""
+        """Begin an episode in each masked environment. last: copies of the last frames of the episodes before"""
         fresh = []
         for index in _numbers(mask):
             if index in self.episodes and index not in last:
@@ -180,7 +180,7 @@ class RewardedEnvs:
         return fresh
 
     def _check_differ(self, index: int, last: Any, first: Any) -> None:
-        """Raise InvalidSampleError if a reset may have drawn over the last frame of the episode before.
+        """Raise InvalidSampleError if a reset may have drawn over the previous episode's last frame.
 
         An environment that draws into one array shows equal frames at every end.
         """
@@ -193,9 +193,9 @@ class RewardedEnvs:
         self._returning_copies.add(index)
 
     def _score(self, episodes: Mapping[RewardedEpisode, bool]) -> None:
-        """Collect known scores, and request those of newest frames that are due. Raises RewardError.
+        """Collect known scores, and request those that are due for newest frames. Raises RewardError.
 
-        episodes: to each, True if its newest frame is its last
+        episodes: True for an episode whose newest frame is its last
         """
         has_dropped, self._has_dropped = self._has_dropped, False  # after an error, a reset may drop a reward
         try:

@@ -1,32 +1,32 @@
 # SPDX-License-Identifier: MIT
-"""Gymnasium environments with the reward of a served reward model.
+"""Gymnasium environments with rewards from a served reward model.
 
 env = gymnasium.make("CartPole-v1", render_mode="rgb_array")
 env = RewardModelWrapper(env, partial(RewardClient, "grpc://localhost:8001"), "balance the pole")
 
-A wrapper keeps all frames of the running episode, H * W * 3 bytes a step. The rule ``sampling`` selects from them.
+A wrapper keeps all frames of the running episode, H * W * 3 bytes per step. The rule ``sampling`` selects from them.
 
 A wrapper scores the reset, every ``every``-th step (not in mode ``final`` without a success rule), and the last step of
-an episode. With ``blocking``, a step waits for its score. Without ``blocking``, a step uses the newest known score. It
+an episode. With ``blocking``, a step waits for its score. Without ``blocking``, a step uses the newest known score, and
 requests its own only if fewer than ``max_pending`` steps have open requests. The reset always waits for its score. The
 last step waits, too, and cancels older requests; without ``blocking``, ``await_last=False`` leaves it unscored.
 
 ``info["reward_model"]`` has the same keys after a reset and after a step: the returned ``reward`` and the environment's
-own ``env_reward`` (NaN at a reset), ``progress`` and ``success`` of the newest known score (success is NaN if the
+own ``env_reward`` (NaN at a reset), ``progress`` and ``success`` from the newest known score (success is NaN if the
 checkpoint does not predict it), its ``step``, its ``lag`` in steps, the steps ``skipped`` in this episode, and the
-other scores that the checkpoint gives unasked (``StepScore.more_scores``). With ``terminate_on_success`` or
-``success_bonus`` it has ``succeeded``.
+other scores that the checkpoint gives by default (``StepScore.more_scores``). With ``terminate_on_success`` or
+``success_bonus`` there is also ``succeeded``.
 
 ``reset`` and ``step`` raise RewardError; an error never becomes a reward. If the server failed, the episode keeps the
 frame, and in delta mode the next reward includes its change. If the frame was lost, the next ``step`` raises
 ResetNeeded. A step after an episode's end does, too, unless the environment resets in that step.
 
 ``compute_reward`` of RewardModelWrapper raises NotImplementedError: hindsight relabelling would mix the environment's
-rewards with the model's. With a Monitor or RecordEpisodeStatistics inside a wrapper, ``info["episode"]`` has the sum of
-the model's rewards. RewardModelWrapper adds it at an end by ``terminate_on_success``, which they do not see.
+rewards with the model's. With a Monitor or RecordEpisodeStatistics inside a wrapper, ``info["episode"]`` has the
+model's summed rewards. They do not see an end by ``terminate_on_success``, so RewardModelWrapper adds the sum there.
 
-A time limit belongs inside the wrapper, as ``gymnasium.make`` puts it. A reset of an unended episode that drops a
-reward logs a warning, once. In mode ``final``, a second such reset in a row, with no end of an episode and no error in
+A time limit belongs inside the wrapper, as ``gymnasium.make`` puts it. If a reset drops the reward of an unended
+episode, a warning is logged once. In mode ``final``, a second such reset in a row, with no episode end and no error in
 between, raises ValueError.
 """
 
@@ -53,18 +53,18 @@ _UNBATCH = (
 
 
 class RewardModelWrapper(gymnasium.Wrapper):
-    """An environment with the reward of a reward model, by the rules in the module's docstring.
+    """An environment with a reward model's rewards, by the rules in the module's docstring.
 
     client: a RewardClient, which stays open; or a function that makes a client at the first reset, which ``close()``
         closes. Pass a function if the environment will run in another process (AsyncVectorEnv)
-    task: the task sentence, or a function that reads it from the info of each reset
+    task: the task sentence, or a function that reads it from the info at each reset
 
-    A step after an episode's end raises ResetNeeded. With ``Autoreset(RewardModelWrapper(env, ...))`` of
+    A step after an episode's end raises ResetNeeded. With ``Autoreset(RewardModelWrapper(env, ...))`` from
     ``gymnasium.wrappers``, this step begins a new episode instead, with reward 0. If ``env`` itself resets in the step
     that ends an episode, that step raises InvalidSampleError, unless frames come from an observation before the reset.
 
-    Raises ValueError if ``options`` names a source of frames that ``env`` lacks, and for an ``Autoreset`` among the
-    wrappers of ``env``; TypeError if ``env`` is no ``gymnasium.Env``.
+    Raises ValueError if ``options`` names a frame source that ``env`` lacks, and for an ``Autoreset`` among the
+    wrappers around ``env``; TypeError if ``env`` is not a ``gymnasium.Env``.
     """
 
     def __init__(
@@ -132,7 +132,7 @@ def check_kind(env: Any, kind: type[Any]) -> None:
 
 
 def _layers(env: gymnasium.Env[Any, Any]) -> Iterator[gymnasium.Env[Any, Any]]:
-    """The environment, and those inside its wrappers."""
+    """Yield the environment, and those inside its wrappers."""
     yield env
     while isinstance(env, gymnasium.Wrapper):
         env = env.env
@@ -140,20 +140,20 @@ def _layers(env: gymnasium.Env[Any, Any]) -> Iterator[gymnasium.Env[Any, Any]]:
 
 
 def _is_batch(env: gymnasium.Env[Any, Any]) -> bool:
-    """True for an environment of ManiSkill or Isaac Lab, unless a wrapper picks the only environment of its batch."""
+    """True for a ManiSkill or Isaac Lab environment, unless a wrapper picks the only environment in the batch."""
     single = getattr(env.unwrapped, "single_observation_space", None)
     return single is not None and all(layer.observation_space != single for layer in _layers(env))
 
 
 def tasks_of(task: str | Sequence[str], num_envs: int) -> list[str]:
-    """Return a task sentence for each environment of a vector. Raises ValueError for another number of sentences."""
+    """Return a task sentence for each environment in a vector. Raises ValueError for another number of sentences."""
     tasks = [task] * num_envs if isinstance(task, str) else list(task)
     require("task", len(tasks) == num_envs, f"one for each of the {num_envs} environments", len(tasks))
     return tasks
 
 
 def check_frame_source(options: RewardOptions, render_mode: str | None, space: gymnasium.Space[Any]) -> None:
-    """Raise ValueError if the options name a source of frames that the environment lacks."""
+    """Raise ValueError if the options name a frame source that the environment lacks."""
     if options.renders and render_mode != "rgb_array":
         expected = "'rgb_array', since frames come from render() unless frames_from or cameras say otherwise"
         raise InvalidValueError.at("render_mode", expected, repr(render_mode))

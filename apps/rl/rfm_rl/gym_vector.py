@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Vectors of Gymnasium environments with the reward of a served reward model. ``gym.py`` states the rules.
+"""Gymnasium vector environments with rewards from a served reward model. ``gym.py`` states the rules.
 
 A vector may return torch tensors on a GPU, as ManiSkillVectorEnv does. Nothing here imports torch.
 """
@@ -25,31 +25,31 @@ from rfm_rl.rewards import Info, RewardOptions, correct_statistics
 
 _INSTEAD_OF_SAME_STEP = "make the vector with autoreset_mode=AutoresetMode.NEXT_STEP"
 _REMEDY = 'call reset, for some environments with options={"reset_mask": mask}'
-_MANI_SKILL_MASK = "env_idx"  # ManiSkill's key in the options of a reset
-_RESET_MASK = "reset_mask"  # key in the options of a reset, which Gymnasium's vectors remove
+_MANI_SKILL_MASK = "env_idx"  # ManiSkill's key in reset options
+_RESET_MASK = "reset_mask"  # key in reset options, which Gymnasium's vectors remove
 
 
 class RewardModelVectorWrapper(VectorWrapper):
-    """A vector environment with the reward of a reward model.
+    """A vector environment with a reward model's rewards.
 
     With ``blocking``, a step scores all sub-environments in one call.
 
     client: as in RewardModelWrapper
-    task: one task sentence for all sub-environments, or a sequence with a sentence for each
+    task: one task sentence for all sub-environments, or a sequence with one for each
 
     Rewards are float64 [num_envs]. If ``env`` returns tensors, they are a float32 tensor on its device; terminations
-    are a tensor, too. ``infos["reward_model"]`` has arrays and masks, like Gymnasium's own infos. The mode of autoreset
+    are a tensor, too. ``infos["reward_model"]`` has arrays and masks, like Gymnasium's own infos. The autoreset mode
     matters:
 
     - SAME_STEP: the last scores of an ended episode are in ``infos["final_info"]``.
-    - NEXT_STEP: a step that only resets a sub-environment has reward 0, as in Gymnasium. It waits for the score of that
-      frame even when not blocking.
+    - NEXT_STEP: a step that only resets a sub-environment has reward 0, as in Gymnasium. The step waits for that
+      frame's score even when not blocking.
     - DISABLED: a step after an episode's end raises ResetNeeded.
 
-    Raises ValueError if ``options`` names a source of frames that ``env`` lacks; for SAME_STEP with frames from
+    Raises ValueError if ``options`` names a frame source that ``env`` lacks; for SAME_STEP with frames from
     ``render()``, which never shows an episode's last frame; and for ``terminate_on_success`` unless DISABLED, because
-    an environment that resets by itself does not know of the success. In these two cases, wrap each sub-environment in
-    RewardModelWrapper instead. Raises TypeError if ``env`` is no ``gymnasium.vector.VectorEnv``.
+    an environment that resets by itself does not know about the success. In the last two cases, wrap each
+    sub-environment in RewardModelWrapper instead. Raises TypeError if ``env`` is not a ``gymnasium.vector.VectorEnv``.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         super().close(**kwargs)
 
     def _masked(self, options: Info | None) -> tuple[Mask, Info | None]:
-        """The environments to reset, and the options with the mask as an array. Raises ValueError."""
+        """Return the environments to reset, and the options with the mask as an array. Raises ValueError."""
         got = f"{_MANI_SKILL_MASK}; ManiSkillVectorEnv resets ended environments itself"
         require("options", _MANI_SKILL_MASK not in (options or {}), "a reset of all environments", got)
         if options is None or _RESET_MASK not in options:
@@ -138,13 +138,13 @@ class RewardModelVectorWrapper(VectorWrapper):
         return mask, {**options, _RESET_MASK: mask}
 
     def _check_was_masked(self, options: Info | None) -> None:
-        """Raise ValueError if a vector with a reset of its own has not read the mask: it may have reset all."""
+        """Raise ValueError if a vector with its own reset has not read the mask: it may have reset all."""
         is_left = options is not None and _RESET_MASK in options and self._autoreset_mode is not AutoresetMode.DISABLED
         got = f"{type(self.unwrapped).__name__}, which left it there; reset all environments"
         require(_RESET_MASK, not is_left, "a vector that takes it out of the options", got)
 
     def _check_can_reset(self, twice: Mask) -> None:
-        """Raise ValueError where workers of Gymnasium (1.4) would reset again in the next step, despite this reset.
+        """Raise ValueError where Gymnasium's workers (1.4) would reset again in the next step, despite this reset.
 
         twice: environments that are due to reset in the next step
         """
@@ -173,7 +173,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         return shown[index] if self._options.renders else self._options.frames_of(shown[index])
 
     def _final_observations(self, infos: Info, ended: Mask) -> dict[int, Any]:
-        """Last observations of ended episodes, whose environments already show the next episode."""
+        """Return last observations of ended episodes, whose environments already show the next episode."""
         observations = infos.get("final_obs", [None] * self.num_envs)
         if "final_obs" not in infos and "final_observation" in infos:  # ManiSkill's, a batch like the observations
             observations = list(iterate(self.env.observation_space, infos["final_observation"]))
@@ -192,7 +192,7 @@ class RewardModelVectorWrapper(VectorWrapper):
 
 
 def _like(given: Any, values: npt.NDArray[Any]) -> Any:
-    """The values, as a tensor on the device of ``given`` if this is a tensor: float32, or bool."""
+    """Return the values; if ``given`` is a tensor, as a float32 or bool tensor on its device."""
     if not hasattr(given, "new_tensor"):  # torch may not be installed
         return values
     typed = given.bool() if values.dtype == np.bool_ else given.float()  # ManiSkill's sparse rewards are bool
@@ -200,13 +200,13 @@ def _like(given: Any, values: npt.NDArray[Any]) -> Any:
 
 
 def _of_each(env: VectorEnv, name: str, *args: str) -> Sequence[Any]:
-    """An attribute of each environment, or what a method returns; empty if the vector cannot tell."""
+    """Return each environment's attribute or method result; empty if the vector cannot tell."""
     vector = env.unwrapped
     return vector.call(name, *args) if isinstance(vector, (AsyncVectorEnv, SyncVectorEnv)) else ()
 
 
 def _check_tells_resets(env: VectorEnv, options: RewardOptions) -> None:
-    """Raise ValueError for rendered frames of LeRobot's environments in processes: some reset there unseen."""
+    """Raise ValueError for rendered frames from LeRobot's environments in processes: some reset there unseen."""
     modules = _of_each(env, "__module__") if options.renders and isinstance(env.unwrapped, AsyncVectorEnv) else ()
     is_lerobot = any(str(module).startswith("lerobot.envs") for module in modules)
     expected = "a source of frames in the observation, such as 'pixels', for LeRobot's environments in processes"

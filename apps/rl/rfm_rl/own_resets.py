@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Refuse frames of environments that have reset in the step that ends an episode."""
+"""Refuse frames from environments that reset in the step that ends an episode."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from rfm_client import InvalidSampleError
 from rfm_rl.rewards import Info, RewardOptions
 
 _ENDS = "final_obs", "final_observation", "terminal_observation"  # in info, if the observation is the next episode's
-HAS_RESET = "final_info"  # in info of LeRobot's environments, whose observation is from before the reset
+HAS_RESET = "final_info"  # in info from LeRobot's environments, whose observation is from before the reset
 
 
 class CopiedObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
-    """An environment that returns copies of its observations, for vectors that reset it in another process.
+    """Copies the environment's observations, for vectors that reset it in another process.
 
     Such a vector keeps the array of an episode's last frame and resets the environment, which may draw over it.
     """
@@ -32,7 +32,7 @@ class CopiedObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
 
 @contextmanager
 def watched_resets(env: gymnasium.Env[Any, Any]) -> Iterator[list[Any]]:
-    """Yield a list that grows with each reset in the meantime."""
+    """Yield a list that grows with each reset during the context."""
     resets: list[Any] = []
     reset = env.unwrapped.reset
 
@@ -46,7 +46,7 @@ def watched_resets(env: gymnasium.Env[Any, Any]) -> Iterator[list[Any]]:
 
 @contextmanager
 def copied_steps(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
-    """Let steps return copies of their observations in the meantime."""
+    """Let steps return copies of their observations during the context."""
     step = env.step
 
     def copied(action: Any) -> Any:
@@ -69,7 +69,7 @@ def _replaced(owner: Any, name: str, method: Any) -> Iterator[None]:
 
 
 def check_observes_its_end(info: Info) -> None:
-    """Raise InvalidSampleError if the observation is already the next episode's. info: of an episode's last step."""
+    """Raise InvalidSampleError if the observation is already the next episode's. info: from an episode's last step"""
     found = [key for key in _ENDS if key in info]
     if found:
         expected = f"none of {', '.join(_ENDS)} from an environment that shows the last frame of its episode"
@@ -78,7 +78,7 @@ def check_observes_its_end(info: Info) -> None:
 
 
 def check_renders_its_end(options: RewardOptions, where: str, has_reset: bool) -> None:
-    """Raise InvalidSampleError if ``render()`` shows the next episode: if the last step of an episode has reset."""
+    """Raise InvalidSampleError if ``render()`` shows the next episode: if an episode's last step has reset."""
     if options.renders and has_reset:
         expected = "no reset in the last step of an episode with frames from render()"
         remedy = "take frames from the observation, such as frames_from='pixels'"

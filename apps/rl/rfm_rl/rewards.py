@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rewards of a Gymnasium environment from the scores of its episodes. ``gym.py`` states the rules."""
+"""Turn an episode's scores into Gymnasium rewards. ``gym.py`` states the rules."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from rfm_client.options import InvalidValueError, checked_count, checked_finite,
 Mode: TypeAlias = Literal["absolute", "delta", "shaping", "final"]
 Info: TypeAlias = dict[str, Any]
 
-RELABELS = "compute_reward"  # method of an environment that rewards a step for another goal
-RETURNS = "episode_returns"  # attribute of Monitor and RecordEpisodeStatistics
-_STATISTICS = "episode"  # key in info, of Monitor and RecordEpisodeStatistics
+RELABELS = "compute_reward"  # an environment's method that rewards a step for another goal
+RETURNS = "episode_returns"  # attribute in Monitor and RecordEpisodeStatistics
+_STATISTICS = "episode"  # key in info, from Monitor and RecordEpisodeStatistics
 
-_PAID: dict[Mode, Callable[[float, float, float, bool], float]] = {  # of progress now and before, gamma, the end
+_PAID: dict[Mode, Callable[[float, float, float, bool], float]] = {  # takes progress now and before, gamma, the end
     "absolute": lambda now, before, gamma, is_end: now,
     "delta": lambda now, before, gamma, is_end: now - before,
     "shaping": lambda now, before, gamma, is_end: gamma * now - before,
@@ -31,35 +31,35 @@ _PAID: dict[Mode, Callable[[float, float, float, bool], float]] = {  # of progre
 
 @dataclass(frozen=True, kw_only=True)
 class RewardOptions(FrameOptions):
-    """How to score an episode, and to make rewards of progress. Raises ValueError for contradictory options.
+    """How to score an episode, and to turn progress into rewards. Raises ValueError for contradictory options.
 
-    mode: ``absolute``: the reward is the newest known progress. ``delta``: its change since the step before, so that an
-        episode's rewards add up to its last known progress minus its first, however late scores come. ``shaping``:
-        ``gamma`` times the newest known progress minus that of the step before (potential-based shaping; where it is
-        added to a reward, the progress of a terminal state counts as 0). ``final``: 0, and at the last step of an
-        episode its progress; without a rule of success, only the reset and the last step are scored
-    gamma: discount of the policy's training, above 0 and at most 1, for ``shaping`` alone
-    scale: factor of this reward
-    success_bonus: added once an episode, at the first step that is known to succeed by ``success``, or by
+    mode: ``absolute``: the newest known progress. ``delta``: its change since the step before; an episode's rewards
+        add up to its last known progress minus its first, however late scores come. ``shaping``: ``gamma`` times the
+        newest known progress minus the progress at the step before (potential-based shaping; where it is added to
+        another reward, the progress in a terminal state counts as 0). ``final``: 0, and at an episode's last step
+        its progress; without a success rule, only the reset and the last step are scored
+    gamma: the discount used to train the policy, above 0 and at most 1, only for ``shaping``
+    scale: factor for this reward
+    success_bonus: added once per episode, at the first step that is known to succeed by ``success``, or by
         ``terminate_on_success``; never at the reset. The reset raises ValueError if the checkpoint does not predict
         success
-    success: rule of the bonus; None: ``terminate_on_success``, else the default rule
+    success: the bonus rule; None: ``terminate_on_success``, else the default rule
     add_to_env_reward: True: add the environment's own reward; False: replace it
     every: steps from one score to the next; until a new score comes, ``absolute`` repeats its value
         and ``delta`` is 0
-    terminate_on_success: rule that ends the episode at a success, except at the frame of the reset. The reset raises
+    terminate_on_success: rule that ends the episode at a success, except at the reset's frame. The reset raises
         ValueError if the checkpoint does not predict success
-    frames_from: source of frames, uint8 [H, W, 3]: a key of the observation, or a function from an environment's
+    frames_from: where frames come from, uint8 [H, W, 3]: an observation key, or a function from an environment's
         observation to its frame; None: ``render()``
-    cameras: keys of the frames to score and fuse, in the observation or the result of ``frames_from``; empty: a single
-        camera without a name
-    score: what rewards are made of: ``progress``, or ``remaining_s``: minus the remaining seconds, in place of progress
-        in each mode, so that a step pays the seconds that it gains
+    cameras: keys of the frames to score and fuse, in the observation or the result from ``frames_from``; empty: a
+        single camera without a name
+    score: what rewards are made from: ``progress``, or ``remaining_s``: minus the remaining seconds, in place of
+        progress in each mode, so that a step pays the seconds that it gains
     sampling, fuse, orient, channels, resize: as in ``rfm_client.episodes.FrameOptions``; rendered frames are
         changed alike
-    max_frames: ``frames`` of EpisodeOptions: the rule's number of frames
+    max_frames: ``frames`` in EpisodeOptions: the rule's frame count
     blocking: True: a step waits for its score
-    max_pending: most steps of an environment with open requests when not blocking
+    max_pending: how many of an environment's steps may have open requests when not blocking
     await_last: True: wait for the score of an episode's last step even when not blocking; False: drop open requests
     """
 
@@ -104,7 +104,7 @@ class RewardOptions(FrameOptions):
 
     @property
     def scoring(self) -> dict[str, Any]:
-        """The arguments of ``client.episode`` for its steps."""
+        """The arguments that ``client.episode`` gets."""
         of_frames = {each.name: getattr(self, each.name) for each in fields(FrameOptions)}
         return {**of_frames, "frames": self.max_frames, "success": self.success_rule or SuccessRule()}
 
@@ -115,15 +115,15 @@ class RewardOptions(FrameOptions):
 
     @property
     def shapes_another(self) -> bool:
-        """True if ``shaping`` is added to another reward, whose best policies it then keeps.
+        """True if ``shaping`` is added to another reward, and must keep that reward's best policies.
 
-        This needs a potential of 0 in terminal states (Ng, Harada and Russell 1999; Grzes 2017). Alone, such a shaping
-        would add up to the same return for every policy, so there the last progress counts.
+        This needs a potential of 0 in terminal states (Ng, Harada and Russell 1999; Grzes 2017). Without another
+        reward, such shaping would add up to the same return for every policy, so there the last progress counts.
         """
         return self.mode == "shaping" and (self.add_to_env_reward or self.success_bonus != 0)
 
     def is_due(self, step: int) -> bool:
-        """True if a step between the first and the last of an episode is scored."""
+        """True if a step between an episode's first and last is scored."""
         return (self.mode != "final" or self.success_rule is not None) and step % self.every == 0
 
     @property
@@ -149,12 +149,12 @@ class RewardOptions(FrameOptions):
 
 
 class RewardedEpisode:
-    """The rewards of one episode: its newest known score, and open requests.
+    """One episode's rewards: the newest known score, and open requests.
 
-    index: number of its environment; None: the only environment
-    pending: scores of open requests
+    index: the environment's number; None: the only environment
+    pending: scores from open requests
     known: the newest known score
-    total_reward: sum of its rewards until now
+    total_reward: sum of the rewards so far
     """
 
     def __init__(self, options: RewardOptions, episode: Episode, index: int | None) -> None:
@@ -172,12 +172,12 @@ class RewardedEpisode:
 
     @property
     def is_unpaid(self) -> bool:
-        """True if the episode goes on, and a step of it is not yet paid."""
+        """True if the episode goes on, and one of its steps is not yet paid."""
         paid = 0 if self.known is None or self._options.mode == "final" else self.known.step
         return not self._has_ended and self.steps.step > paid
 
     def collect(self) -> None:
-        """Take over the scores of completed requests. Raises the RewardError of a failed request."""
+        """Take over scores from completed requests. Raises the RewardError of a failed request."""
         for answer in [answer for answer in self.pending if answer.done()]:
             self.pending.remove(answer)
             self.learn(*answer.result())
@@ -214,7 +214,7 @@ class RewardedEpisode:
         self.succeeded |= ending is not None and score.succeeded
 
     def reward(self, env_reward: float, terminated: bool) -> float:
-        """Return the reward of the newest step, once it has been scored if it is due.
+        """Return the newest step's reward. A step that is due must be scored before.
 
         terminated: True if the environment has reached a terminal state; False at a time limit
         """
@@ -248,9 +248,9 @@ def refuse_relabelling(*_args: object, **_kwargs: object) -> NoReturn:
 
 
 def with_statistics(info: Info, episode: RewardedEpisode, *, has_statistics: bool = False) -> Info:
-    """Return the info of a step. Statistics from a Monitor inside the wrapper show the model's rewards.
+    """Return a step's info. Statistics from a Monitor inside the wrapper show the model's rewards.
 
-    has_statistics: True: a Monitor inside tells of ends, but does not see one by ``terminate_on_success``
+    has_statistics: True: a Monitor inside reports ends, but does not see one by ``terminate_on_success``
     """
     told = info.get(_STATISTICS)
     if isinstance(told, dict) and "r" in told:
@@ -259,7 +259,7 @@ def with_statistics(info: Info, episode: RewardedEpisode, *, has_statistics: boo
 
 
 def correct_statistics(infos: Info, index: int, episode: RewardedEpisode) -> None:
-    """Let the statistics in the infos of a Gymnasium vector show the model's rewards."""
+    """Put the model's rewards into the statistics in a Gymnasium vector's infos."""
     for info in (infos, infos.get("final_info")):
         if isinstance(info, dict) and f"_{_STATISTICS}" in info and info[f"_{_STATISTICS}"][index]:
             for key, value in _statistics(episode).items():

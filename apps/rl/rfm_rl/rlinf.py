@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""A reward model of RLinf whose rewards come from a served checkpoint. Needs RLinf.
+"""An RLinf reward model whose rewards come from a served checkpoint. Needs RLinf.
 
     export RLINF_EXT_MODULE=rfm_rl.rlinf
 
-Each worker of RLinf then calls ``register``, and ``reward.model.model_type: rfm`` selects RfmRewardModel. Its options
+Each RLinf worker then calls ``register``, and ``reward.model.model_type: rfm`` selects RfmRewardModel. Its options
 stand under ``reward.model.rfm``.
 
-With ``reward.reward_mode: history_buffer``, RLinf sends ``history_input[buffer][key][env][t]``: the pictures of an
-environment since its episode began, or the last ``history_size`` of them. Other modes, which send one picture without
+With ``reward.reward_mode: history_buffer``, RLinf sends ``history_input[buffer][key][env][t]``: an environment's
+pictures since its episode began, or the last ``history_size`` of them. Other modes, which send one picture without
 its past, are refused.
 """
 
@@ -45,14 +45,14 @@ Reward: TypeAlias = Literal["progress", "delta", "success"]
 class RfmRewardOptions:
     """The options under ``reward.model.rfm``. Raises ValueError for invalid ones.
 
-    url: address of the server, or a list of addresses
-    client: further options of RewardClient, such as ``timeout_s``
-    episode: options of ``RewardClient.episode``. ``cameras``, by default ``main_images``, are keys of the observations
+    url: server address, or a list of addresses
+    client: further options for RewardClient, such as ``timeout_s``
+    episode: options for ``RewardClient.episode``. ``cameras``, by default ``main_images``, are observation keys
     reward: ``progress`` at the newest picture; ``delta``: its change since the picture before, 0 at the first picture
-        of a window; ``success``: the probability that the task is done
-    task: the task of all environments, instead of ``task_descriptions``
+        in a window; ``success``: the probability that the task is done
+    task: the task for all environments, instead of ``task_descriptions``
     buffer: the history buffer to score, if there are several
-    interval_reward: reward of an environment for which RLinf sends no pictures in this step
+    interval_reward: reward for an environment for which RLinf sends no pictures in this step
     """
 
     url: str | Sequence[str]
@@ -88,7 +88,7 @@ class RfmRewardOptions:
 
 @dataclass(frozen=True)
 class _Window:
-    """The pictures of an environment that RLinf sends in a step, in order of time."""
+    """The pictures that RLinf sends for an environment in a step, in order of time."""
 
     env: int
     task: str
@@ -96,7 +96,7 @@ class _Window:
 
 
 class RfmRewardModel(BaseRewardModel):  # type: ignore[misc]  # RLinf is optional, and so untyped here
-    """A reward model without weights: a server scores the pictures of all environments in one call.
+    """A reward model without weights: a server scores the pictures from all environments in one call.
 
     cfg: RLinf's ``reward.model``. Raises ValueError for invalid options.
     """
@@ -116,7 +116,7 @@ class RfmRewardModel(BaseRewardModel):  # type: ignore[misc]  # RLinf is optiona
         raise NotImplementedError("RfmRewardModel has no weights to train: its rewards come from a server")
 
     def compute_reward(self, observations: Mapping[str, Any]) -> torch.Tensor:
-        """Return the rewards of all environments, float32 [B]. Raises RewardError.
+        """Return the rewards for all environments, float32 [B]. Raises RewardError.
 
         observations: RLinf's reward input. An environment without pictures gets ``interval_reward``
         """
@@ -140,7 +140,7 @@ class RfmRewardModel(BaseRewardModel):  # type: ignore[misc]  # RLinf is optiona
         return found
 
     def _windows(self, observations: Mapping[str, Any], pictures: Mapping[str, Any]) -> list[_Window]:
-        """Return the windows of the environments that have pictures."""
+        """Return a window for each environment that has pictures."""
         dones = observations.get("dones")
         self._tasks.update(map(str, observations.get(TASKS) or ()))
         windows = []
@@ -161,9 +161,9 @@ class RfmRewardModel(BaseRewardModel):  # type: ignore[misc]  # RLinf is optiona
         return windows
 
     def _task(self, env: int, stated: Sequence[str] | None, kept: Sequence[str] | None, is_done: bool) -> str:
-        """Return the task of an environment's pictures.
+        """Return the task for an environment's pictures.
 
-        In the step that ends an episode, RLinf may state the task of the next episode.
+        In the step that ends an episode, RLinf may state the next episode's task.
         """
         if self.options.task is not None:
             return self.options.task
@@ -179,7 +179,7 @@ class RfmRewardModel(BaseRewardModel):  # type: ignore[misc]  # RLinf is optiona
         return str(tasks[0])
 
     def _rewards(self, windows: Sequence[_Window]) -> list[float]:
-        """Return the reward of each window, all from one call."""
+        """Return each window's reward, all from one call."""
         past = [window for window in windows if len(window.frames) > 1] if self.options.reward == "delta" else []
         with ExitStack() as stack:
             episodes = [stack.enter_context(self._episode(window, len(window.frames))) for window in windows]
@@ -194,7 +194,7 @@ class RfmRewardModel(BaseRewardModel):  # type: ignore[misc]  # RLinf is optiona
         return [at - earlier.get(window.env, at) for window, at in zip(windows, now, strict=True)]
 
     def _episode(self, window: _Window, count: int) -> Episode:
-        """Return an episode with the first pictures of a window."""
+        """Return an episode with the first pictures in a window."""
         episode = self._client.episode(window.task, env=window.env, **self.options.episode)
         for frame in window.frames[:count]:
             episode.keep(frame)
@@ -202,12 +202,12 @@ class RfmRewardModel(BaseRewardModel):  # type: ignore[misc]  # RLinf is optiona
 
 
 def register() -> None:
-    """Add the reward model to RLinf, as ``model_type: rfm``. RLinf calls it in each worker."""
+    """Add the reward model to RLinf, as ``model_type: rfm``. RLinf calls this in each worker."""
     reward_model_registry[MODEL_TYPE] = RfmRewardModel
 
 
 def _chosen(buffer: str | None, names: Sequence[str]) -> str | None:
-    """Return the name of the buffer to score; None: there is none."""
+    """Return which buffer to score; None: there is none."""
     if buffer is not None:
         return buffer
     require(f"{_WHERE}.buffer", len(names) <= 1, f"one of {', '.join(names)}", "none")
@@ -215,7 +215,7 @@ def _chosen(buffer: str | None, names: Sequence[str]) -> str | None:
 
 
 def _num_envs(observations: Mapping[str, Any], pictures: Mapping[str, Any]) -> int:
-    """Return the number of environments. Raises InvalidSampleError if parts of the input differ in it."""
+    """Return how many environments there are. Raises InvalidSampleError if parts of the input disagree."""
     parts = {key: observations.get(key) for key in (TASKS, "dones")} | dict(pictures)
     counts = {key: len(values) for key, values in parts.items() if values is not None}
     expected = "as many environments in each part"
@@ -224,13 +224,13 @@ def _num_envs(observations: Mapping[str, Any], pictures: Mapping[str, Any]) -> i
 
 
 def _image(picture: Any) -> UInt8Array:
-    """Return a picture without the axis of a single view, [1, H, W, 3]."""
+    """Return a picture without the axis for a single view, [1, H, W, 3]."""
     array = as_array(picture)
     return array[0] if array.ndim == 4 and len(array) == 1 else array
 
 
 def _success(score: StepScore) -> float:
-    """Return the probability of success. Raises InvalidSampleError if the checkpoint does not predict it."""
+    """Return the success probability. Raises InvalidSampleError if the checkpoint does not predict it."""
     expected = "progress or delta, since this checkpoint does not predict success"
     require(f"{_WHERE}.reward", not np.isnan(score.success), expected, "success", InvalidSampleError)
     return score.success
@@ -241,7 +241,7 @@ def _of(env: int) -> str:
 
 
 def _plain(node: Any) -> Any:
-    """Return a node of OmegaConf as dicts, lists and values."""
+    """Return an OmegaConf node as dicts, lists and values."""
     if isinstance(node, Mapping):
         return {str(key): _plain(value) for key, value in node.items()}
     return [_plain(value) for value in node] if isinstance(node, Sequence) and not isinstance(node, str) else node

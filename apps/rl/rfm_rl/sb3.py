@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Vectors of Stable-Baselines3 with the reward of a served reward model. Needs ``./apps/rl[sb3]``.
+"""Stable-Baselines3 vectors with rewards from a served reward model. Needs ``./apps/rl[sb3]``.
 
 envs = make_vec_env("CartPole-v1", 8, env_kwargs={"render_mode": "rgb_array"}, wrapper_class=RenderedFrame)
 envs = RewardModelVecEnv(envs, partial(RewardClient, "grpc://localhost:8001"), "balance the pole")
 
-``gym.py`` states the rules. A ``VecEnv`` resets an environment in the step that ends its episode. The last frame
-of that episode is then in the info: ``terminal_observation``, or the frame of RenderedFrame.
+``gym.py`` states the rules. A ``VecEnv`` resets an environment in the step that ends its episode. That episode's last
+frame is then in the info: ``terminal_observation``, or the frame from RenderedFrame.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ except ImportError as error:
 
 __all__ = ["RenderedFrame", "RewardModelVecEnv", "RewardOptions"]
 
-_FRAME = "rendered_frame"  # key in the infos of RenderedFrame
+_FRAME = "rendered_frame"  # key in the infos from RenderedFrame
 _RENDERED = "make_vec_env(..., wrapper_class=RenderedFrame)"
 
 
 class RenderedFrame(gymnasium.Wrapper[Any, Any, Any, Any]):
     """An environment that renders at each step, for a RewardModelVecEnv around its ``VecEnv``.
 
-    The picture is part of the info, since the ``VecEnv`` resets before it returns.
+    The picture is part of the info, because the ``VecEnv`` resets before it returns.
     """
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
@@ -62,18 +62,18 @@ class RenderedFrame(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is optional, and so untyped here
-    """A ``VecEnv`` with the reward of a reward model. With ``blocking``, a step scores all environments in one call.
+    """A ``VecEnv`` with a reward model's rewards. With ``blocking``, a step scores all environments in one call.
 
     client: as in RewardModelWrapper
-    task: one task sentence for all environments, or a sequence with a sentence for each
+    task: one task sentence for all environments, or a sequence with one for each
 
-    ``infos[i]["reward_model"]`` is as in RewardModelWrapper. ``reset_infos`` has that of each reset.
+    ``infos[i]["reward_model"]`` is as in RewardModelWrapper. ``reset_infos`` has the same for each reset.
 
-    Raises ValueError if ``options`` names a source of frames that ``venv`` lacks; for frames from ``render()`` unless
+    Raises ValueError if ``options`` names a frame source that ``venv`` lacks; for frames from ``render()`` unless
     each environment is wrapped in RenderedFrame; and for ``terminate_on_success``, because an environment that resets
-    by itself does not know of the success: wrap each environment in RewardModelWrapper instead. Raises ValueError for a
-    ``VecNormalize`` inside: off-policy algorithms would store the rewards that it got. Raises TypeError if ``venv`` is
-    no ``VecEnv``.
+    by itself does not know about the success: wrap each environment in RewardModelWrapper instead. Raises ValueError
+    for a ``VecNormalize`` inside: off-policy algorithms would store the rewards that it got. Raises TypeError if
+    ``venv`` is not a ``VecEnv``.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         return observations, rewards.astype(np.float32), dones, infos
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Call a method of the environments. Raises NotImplementedError for ``compute_reward``, which HER calls."""
+        """Call a method on the environments. Raises NotImplementedError for ``compute_reward``, which HER calls."""
         if method_name == RELABELS:
             refuse_relabelling()
         results: list[Any] = self.venv.env_method(method_name, *args, indices=indices, **kwargs)
@@ -164,7 +164,7 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         self.venv.close()
 
     def _first(self, index: int, observations: Any) -> Any:
-        """The first frame of an environment's new episode."""
+        """Return the first frame in an environment's new episode."""
         if not self._reward_options.renders:
             return self._reward_options.frames_of(_of_env(observations, index))
         frame = self.reset_infos[index].pop(_FRAME, None)
@@ -187,7 +187,7 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
 
 
 def _of_env(observations: Any, index: int) -> Any:
-    """The observation of one environment in a ``VecEnv``'s: arrays [num_envs, ...], or a dict or tuple of them."""
+    """Return one environment's observation from a ``VecEnv``'s: arrays [num_envs, ...], or a dict or tuple of them."""
     if isinstance(observations, Mapping):
         return {key: value[index] for key, value in observations.items()}
     if isinstance(observations, tuple):
