@@ -192,7 +192,7 @@ class LabelFile:
     """An existing label file, which a run may replace.
 
     provenance: writer, dataset and recipe; empty: another program wrote the labels
-    digests: by number of the labelled episode
+    digests: digest by episode number
     cost: from the last run that scored; None: unknown
     option: command-line option that chooses another path
     """

@@ -78,13 +78,14 @@ def _names(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class LabelOptions(Settings):
-    """Options of a labelling run. Raises ConfigError, a ValueError.
+    """Options for a labelling run. Raises ConfigError, a ValueError.
 
     cameras: empty: all but depth cameras
-    sampling, frames: None: those of the checkpoint's training (``Sampling.of``)
+    sampling, frames: None: as in the checkpoint's training (``Sampling.of``)
     episodes: numbers; None: all
-    filter_key: only these of the episodes; None: all
-    shard: (i, n): label share i, from 0, of n equal shares, without label files; a later run without shard writes them
+    filter_key: label only its episodes; None: all
+    shard: (i, n): label share i out of n equal shares, counted from 0, without label files; a later run without shard
+        writes them
     parts: None: ``.<name>_parts`` in the output folder
     """
 
@@ -180,7 +181,7 @@ DEFAULTS = LabelOptions()
 
 @dataclass(frozen=True)
 class RayOptions(Settings):
-    """Ray cluster, number of actors and their GPUs. Raises ConfigError, a ValueError."""
+    """Ray cluster, actor count and GPUs per actor. Raises ConfigError, a ValueError."""
 
     TITLE: ClassVar[str] = "With --engine ray"
 

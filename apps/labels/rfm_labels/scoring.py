@@ -46,7 +46,7 @@ from rfm_labels.scorer import DECISIVE, Scorer
 from rfm_labels.writing import Parts
 
 FRAMES_AT_A_TIME = 64  # per encoder request, as in the encoder's forward pass
-MAX_BYTES = 32 * 2**20  # samples per scorer call
+MAX_BYTES = 32 * 2**20  # for the samples in one scorer call
 MAX_FRAME_BYTES = 2 * 2**30  # for all workers in the process
 
 _NOT_ABOUT_ONE_EPISODE = (ServerUnavailableError, DeadlineExceededError, ModelNotFoundError, AccessDeniedError)

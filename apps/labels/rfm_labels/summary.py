@@ -46,7 +46,7 @@ class Summary:
 
     @property
     def outcomes(self) -> dict[str, npt.NDArray[np.bool_]]:
-        """Map outcome names to bool [E]; empty if success is not predicted.
+        """bool [E] by outcome name; empty if success is not predicted.
 
         An episode succeeds if most of its last three frames have a success of 0.5 or more.
         """
