@@ -42,7 +42,7 @@ from rfm_gateway.config import GatewayConfig
 UNIFORM, MIXED, AS_LONG_AS_MIXED = (16, 16), (1, 16), (8, 9)
 OURS = ("gRPC", "HTTP", SHARED_MEMORY, "gateway")
 ONE, MANY = Load(1, 0, UNIFORM), Load(32, 0, UNIFORM)
-SCENARIOS = {  # name: load, ways to reach this server, True: also the peers
+SCENARIOS = {  # name: load, ways to reach this server, True: also measure the peers
     "1 caller": (ONE, ("gRPC",), True),
     "32 callers": (MANY, ("gRPC", "gateway"), True),
     "32 callers, 8 or 9 frames": (replace(MANY, frames=AS_LONG_AS_MIXED), ("gRPC",), False),
@@ -58,7 +58,7 @@ FULL = {
 
 
 def servers(arguments: argparse.Namespace, folder: Path) -> None:
-    """Measure all ways to reach this server, the bare engine and the peers, for each size of a checkpoint."""
+    """Measure all ways to reach this server, the bare engine and the peers, for each checkpoint size."""
     rows: list[Row] = []
     for size in arguments.sizes:
         measured = checkpoint(size, folder)
@@ -81,7 +81,7 @@ def servers(arguments: argparse.Namespace, folder: Path) -> None:
                 asked = [way for way in made if way in ways or (with_peers and way in PEERS)]
                 batches = (
                     () if load.frame_px else (1,) if load.callers == 1 else (1, 8, 32)
-                )  # it measures embeddings alone
+                )  # the engine measures only embeddings
                 alone = replace(load, rate_per_s=0, seconds=arguments.seconds)
                 for number in range(arguments.rounds):
                     of_bare = {f"bare engine, batch {batch}": bare.measure(alone, batch) for batch in batches}
@@ -118,7 +118,7 @@ def commits(arguments: argparse.Namespace, folder: Path) -> None:
 
 
 def _rows(of: Row, number: int, measured: Mapping[str, Row]) -> list[Row]:
-    """Return a row for each way, and print the rates."""
+    """Return one row per way, and print the rates."""
     rows = [{**of, "way": way, "round": number, **figures} for way, figures in measured.items()]
     rates = ", ".join(f"{row['way']} {row['samples_per_s']:.0f}" for row in rows)
     print(f"{', '.join(map(str, of.values()))}, round {number + 1}: {rates} samples/s", flush=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The measured servers, each with separate processes of callers, and the bare engine."""
+"""The measured servers, each with separate caller processes, and the bare engine."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ VLM = HERE.parent / "tests" / "golden" / "vlm"
 VLM_CHECKPOINT, VLM_BASE = VLM / "q3_tok_disc10" / "checkpoint", VLM / "bases" / "q3"
 PEERS = {"FastAPI": "fastapi_server.py", "mosec": "mosec_server.py"}
 START_S = 120
-CORES_OF_A_PROCESS = 4  # one for a Python process of callers, the others for the server
+CORES_OF_A_PROCESS = 4  # one for a Python caller process, the others for the server
 US_PER_S = 1e6
 DEFAULT_SIZE = RewindConfig(  # upstream's defaults
     video_feature_dim=768,
@@ -56,8 +56,8 @@ DEFAULT_SIZE = RewindConfig(  # upstream's defaults
 class Checkpoint:
     """A checkpoint and its export.
 
-    threads: threads of torch in every server
-    widths: widths of a frame embedding and a text embedding; 0: the checkpoint takes frames
+    threads: torch threads in every server
+    widths: frame and text embedding width; 0: the checkpoint takes frames
     """
 
     folder: Path
@@ -88,11 +88,11 @@ def checkpoint(size: str, folder: Path) -> Checkpoint:
 
 
 class Contestant:
-    """A context with a running server and separate processes of its callers, one for every four cores.
+    """A context with a running server and separate caller processes, one for every four cores.
 
     way: how callers reach the server, see load.py
     server: context that yields the server's address
-    widths: widths of a frame embedding and a text embedding
+    widths: frame and text embedding width
     """
 
     def __init__(self, way: str, server: AbstractContextManager[str], widths: tuple[int, int]) -> None:
@@ -115,7 +115,7 @@ class Contestant:
         self._server.__exit__(None, None, None)
 
     def measure(self, load: Load) -> dict[str, float]:
-        """Return rates, latencies, and CPU microseconds a sample. Raises RuntimeError if a process of callers ends."""
+        """Return rates, latencies, and CPU microseconds per sample. Raises RuntimeError if a caller process ends."""
         callers = self._callers[: load.callers or 1]
         asking = [psutil.Process(process.pid) for process in callers]
         before_s = _cpu_s(self._processes), _cpu_s(asking)
@@ -131,7 +131,7 @@ class Contestant:
 
 
 def shares(load: Load, count: int) -> list[Load]:
-    """Split a load among ``count`` processes, at most one for each caller."""
+    """Split a load among ``count`` processes, at most one per caller."""
     each, more = divmod(load.callers, count)
     rate_per_s = load.rate_per_s / count
     return [replace(load, callers=each + (number < more), rate_per_s=rate_per_s) for number in range(count)]
@@ -150,7 +150,7 @@ def _cpu_s(processes: Sequence[psutil.Process] | set[psutil.Process]) -> float:
 
 
 class BareEngine:
-    """``Engine.evaluate`` in this process, batch after batch: the upper bound for a server around it."""
+    """Runs ``Engine.evaluate`` in this process, batch after batch: the upper bound for a server around it."""
 
     def __init__(self, measured: Checkpoint) -> None:
         self._engine, self._widths = Engine.of(published.load(measured.folder)), measured.widths
@@ -173,10 +173,10 @@ class BareEngine:
 
 @contextmanager
 def serving(checkpoint: Path, folder: Path, settings: Mapping[str, Any], python: str) -> Iterator[dict[str, str]]:
-    """Serve a checkpoint with the packages of another Python, ignoring PYTHONPATH; yield the addresses by name.
+    """Serve a checkpoint with another Python's packages, ignoring PYTHONPATH; yield the addresses by name.
 
     folder: for the repository and the log
-    settings: section ``export`` of a configuration
+    settings: the configuration's ``export`` section
     """
     program = str(Path(shutil.which(python) or python).absolute())
     words = [program, str(HERE / "serving.py"), str(checkpoint.absolute()), str(folder), json.dumps(settings)]

@@ -38,26 +38,26 @@ from report import Row
 from rfm.config import ExportConfig
 
 NAME = "gpu"
-LIMIT_S = 570  # the rest of ten minutes is for servers that end
+LIMIT_S = 570  # the rest of ten minutes is for shutting down servers
 TESTS_S = 150
-SOURCES = ("", "client", "apps/gateway", "apps/labels", "export", "commands")  # folders of a checkout with packages
-NOW, BEFORE = "now", "before"  # names of runs
-# Packages that may be there, compiled for a newer numpy than that of Triton's Python backend. transformers uses them
-# where they exist, and nothing here needs them.
+SOURCES = ("", "client", "apps/gateway", "apps/labels", "export", "commands")  # package folders in a checkout
+NOW, BEFORE = "now", "before"  # run names
+# These packages may be installed but compiled for a newer numpy than Triton's Python backend has. transformers uses
+# them where they exist, and nothing here needs them.
 HIDDEN = ("scipy", "sklearn", "pandas")
 KEY = ("what", "way", "graphs", "max_batch_size", "frames", "size", "callers", "repeated")
 FIGURES = ("samples_per_s", "failed", "p50_ms", "p99_ms", "device_ms", "tokens", "peak_gib")
 
 
 class TimeIsUpError(Exception):
-    """The limit is reached."""
+    """Raised when the time limit is reached."""
 
 
 @dataclass(frozen=True)
 class Run:
     """Settings that all parts need.
 
-    checkout: folder with the packages that are measured
+    checkout: folder with the measured packages
     folder: for checkpoints and repositories
     """
 
@@ -67,9 +67,9 @@ class Run:
 
     @property
     def python(self) -> str:
-        """Return a Python that prefers the packages of the checkout to its own, made at first use.
+        """Return a Python that prefers the checkout's packages to its own, created at first use.
 
-        Triton's Python backend does not read PYTHONPATH, but takes the packages of the first python3 in PATH.
+        Triton's Python backend ignores PYTHONPATH, but uses the packages belonging to the first python3 in PATH.
         """
         place = self.folder / "venv"
         if not place.exists():
@@ -82,11 +82,11 @@ class Run:
 
     @property
     def num_gpus(self) -> int:
-        """GPUs of each server."""
+        """GPUs for each server."""
         return 0 if self.scale.device == "cpu" else 1
 
     def checkpoint(self, kind: str) -> Path:
-        """Return the folder of a random checkpoint, written at first use."""
+        """Return a random checkpoint's folder, written at first use."""
         written = self.folder / kind
         if not written.exists():
             random_checkpoints.write(self.folder, kind, self.scale.size, self.scale.device)
@@ -127,7 +127,7 @@ def engine(run: Run) -> Iterator[Row]:
 
 
 def robometer(run: Run, graphs: bool = False) -> Iterator[Row]:
-    """Serve Robometer: each number of callers, repeated frames, large frames."""
+    """Serve Robometer: different caller counts, repeated frames, large frames."""
     scale, (one, some, many) = run.scale, run.scale.callers
     settings = {"base_model": str(BASE_MODEL), **({"cuda_graphs": True} if graphs else {})}
     asked = [(n, FRAMES, scale.small_px, False) for n in (one, many, some)]
@@ -137,7 +137,7 @@ def robometer(run: Run, graphs: bool = False) -> Iterator[Row]:
 
 
 def graphs(run: Run) -> Iterator[Row]:
-    """Serve Robometer with CUDA graphs on a GPU, where the export knows the setting."""
+    """Serve Robometer with CUDA graphs on a GPU, if the export knows the setting."""
     if run.scale.device != "cpu" and "cuda_graphs" in {field.name for field in fields(ExportConfig)}:
         yield from robometer(run, graphs=True)
 
@@ -153,7 +153,7 @@ def batches(run: Run) -> Iterator[Row]:
 
 
 def encoders(run: Run) -> Iterator[Row]:
-    """Serve the demo's ReWiND with encoders of raw frames: distinct and repeated ones."""
+    """Serve the demo's ReWiND with encoders on raw frames, both distinct and repeated."""
     _, some, many = run.scale.callers
     asked = [(n, FRAMES, run.scale.small_px, repeated) for repeated in (False, True) for n in (some, many)]
     checkpoint = DEMO / "rfm" / "1" / "checkpoint"
@@ -173,7 +173,7 @@ def roboreward(run: Run) -> Iterator[Row]:
 
 
 def rynnvalue(run: Run) -> Iterator[Row]:
-    """Serve RynnValue, where the checkout describes robots at export."""
+    """Serve RynnValue, if the checkout describes robots at export."""
     if "robot_description" in (run.checkout / "rfm" / "config.py").read_text():
         asked = [(n, FRAMES, run.scale.small_px, False) for n in run.scale.callers]
         yield from served(run, "rynnvalue", run.checkpoint(RYNNVALUE), DESCRIBED, asked)
@@ -188,7 +188,7 @@ def served(
     *,
     graphs: bool = False,
 ) -> Iterator[Row]:
-    """Export and serve a checkpoint, and measure it.
+    """Export, serve and measure a checkpoint.
 
     asked: callers, frames, height and width, whether frames are repeated
     """
@@ -258,7 +258,7 @@ def aims(scale: Scale) -> list[Aim]:
 
 
 def figure(aim: Aim, rows: Sequence[Row], graphs: bool) -> float | None:
-    """Return the figure of an aim; None: not measured. Lacking a divisor with graphs, divide by the plain one."""
+    """Return the figure for an aim; None: not measured. Without a divisor measured with graphs, use the plain one."""
     found = _row(rows, {**aim.of, "graphs": graphs})
     if found is None:
         return None
@@ -274,7 +274,7 @@ def _row(rows: Sequence[Row], of: Row) -> Row | None:
 
 
 class Results:
-    """gpu.json and gpu.md in a folder. A measurement replaces an earlier one of the same run."""
+    """Writes gpu.json and gpu.md to a folder. A measurement replaces an earlier one from the same run."""
 
     def __init__(self, folder: Path, name: str, scale: Scale) -> None:
         self._folder, self._name, self._scale = folder, name, scale
@@ -283,7 +283,7 @@ class Results:
         self._runs.setdefault(name, {"rows": []})
 
     def about(self, told: Mapping[str, Any]) -> None:
-        """Note the machine of this run."""
+        """Record the machine used in this run."""
         self._runs[self._name]["machine"] = told
 
     def add(self, row: Row) -> None:
@@ -296,7 +296,7 @@ class Results:
         (self._folder / f"{NAME}.md").write_text(self.text())
 
     def text(self) -> str:
-        """Return gpu.md."""
+        """Return the text for gpu.md."""
         return "\n".join(self._lines()) + "\n"
 
     def _lines(self) -> Iterator[str]:
@@ -350,7 +350,7 @@ def _cell(value: Any) -> str:
 
 
 def about(checkout: Path, device: str) -> dict[str, Any]:
-    """Return the device, packages, commit and date of a run."""
+    """Return a run's device, packages, commit and date."""
     told = report.machine()
     marked = checkout / "COMMIT" if checkout != report.ROOT else report.ROOT / "build" / "gpu" / "COMMIT"
     commit = told["commit"] if checkout == report.ROOT else ""
@@ -360,7 +360,7 @@ def about(checkout: Path, device: str) -> dict[str, Any]:
 
 
 def measure(run: Run, parts: Sequence[str], results: Results, limit_s: int) -> list[str]:
-    """Run the parts until the limit, and return those that failed. The others run all the same."""
+    """Run the parts until the limit, and return those that failed. The others still run."""
     failed: list[str] = []
     began_s = time.perf_counter()
     signal.signal(signal.SIGALRM, _up)
@@ -384,7 +384,7 @@ def _up(*_: object) -> None:
 
 
 def main() -> None:
-    """Measure, and end with an error that names the parts that failed or found no time."""
+    """Measure, then exit with an error that names the parts that failed or ran out of time."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--checkout", type=Path, help="measure the packages of another checkout, as the run 'before'")

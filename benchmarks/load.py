@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Callers of one server, as a program. Reads a Load as a line of JSON from standard input, writes Calls as a line.
+"""Program that calls one server. Reads each Load as a JSON line from standard input, and writes Calls as a JSON line.
 
 Closed loop: each caller makes a call and waits for the answer. Open loop: calls begin at random times (Poisson), even
-while earlier answers are late, so that a slow answer does not hide the calls behind it. A latency counts from the time
+while earlier answers are late, so that a slow answer does not hide the calls behind it. Latency counts from the time
 when the call was due. Each caller stands for a separate client, so calls are not joined.
 
-Raw frames are distinct by default: no frame comes twice, so no feature of a frame is in the server's cache.
+Raw frames are distinct by default: no frame repeats, so the server's cache never has a frame's features.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from rfm_client import (
 )
 
 NUM_SAMPLES = 256
-NUM_FILMED = 16  # distinct samples of raw frames of a load that repeats them
-IN_FLIGHT = 4096  # more than any load needs, so that no client holds calls back
+NUM_FILMED = 16  # distinct raw frame samples in a load that repeats them
+IN_FLIGHT = 4096  # more than any load needs, so that clients never hold calls back
 KEEP_ALIVE_S = 3.0  # peers close a connection after 5 idle seconds, perhaps just as a call reuses it
 MS_PER_S = 1e3
 PEERS = {
@@ -53,15 +53,15 @@ SHARED_MEMORY = "shared memory"  # a way
 class Load:
     """A load on a server. Either ``callers`` or ``rate_per_s`` is 0.
 
-    callers: concurrent callers of the closed loop
+    callers: concurrent callers in the closed loop
     seconds: duration
-    frames: least and greatest number of frames of a sample
+    frames: smallest and largest frame count per sample
     mixed: True: all three sample types in turn; False: only progress
-    rate_per_s: calls a second of the open loop
-    together: samples of a call
-    frame_px: height and width of raw frames; None: embeddings
-    repeated: True: NUM_FILMED samples of raw frames in turn; False: each frame is new
-    warm_up_s: time before the calls that count
+    rate_per_s: calls per second in the open loop
+    together: samples per call
+    frame_px: raw frame height and width; None: embeddings
+    repeated: True: cycle through NUM_FILMED raw frame samples; False: each frame is new
+    warm_up_s: time before calls count
     """
 
     callers: int
@@ -77,10 +77,10 @@ class Load:
 
 @dataclass(frozen=True)
 class Calls:
-    """Results of the calls of one process after the warm-up.
+    """One process's calls after the warm-up.
 
-    latencies_s: of answered calls
-    failed: number of samples without scores
+    latencies_s: for answered calls
+    failed: samples without scores
     took_s: duration, up to the last answer
     """
 
@@ -91,11 +91,11 @@ class Calls:
 
 @dataclass(frozen=True)
 class Measured:
-    """Rate and latencies of calls under a load.
+    """Call rate and latencies under a load.
 
-    samples_per_s: scored samples a second
-    failed: number of samples without scores
-    p50_ms, p99_ms: latencies of answered calls
+    samples_per_s: scored samples per second
+    failed: samples without scores
+    p50_ms, p99_ms: latencies for answered calls
     took_s: duration, up to the last answer
     """
 
@@ -107,7 +107,7 @@ class Measured:
 
     @classmethod
     def of(cls, calls: Sequence[Calls], together: int = 1) -> Measured:
-        """Combine the results of processes that called at the same time. together: samples in a call"""
+        """Combine the results from processes that called at the same time. together: samples per call."""
         latencies_s = [latency_s for each in calls for latency_s in each.latencies_s]
         rate = sum(len(each.latencies_s) * together / each.took_s for each in calls)
         p50, p99 = np.percentile(latencies_s, [50, 99]) * MS_PER_S if latencies_s else (float("nan"),) * 2
@@ -150,9 +150,9 @@ def _embedded(random: np.random.Generator, video_dim: int, text_dim: int) -> Cal
 
 
 def _filmed(load: Load) -> Callable[[int, int, int], Trajectory]:
-    """Return a function that makes a trajectory from a sample's number, its first frame and the number of frames.
+    """Return a function that makes a trajectory from a sample's number, its first frame and its frame count.
 
-    Frames are views into random bytes, each video one byte further than the video before, so a frame costs nothing.
+    Frames are views into random bytes. Each video starts one byte after the previous one, so a frame costs nothing.
     """
     assert load.frame_px is not None
     size = 3 * load.frame_px[0] * load.frame_px[1]
@@ -187,7 +187,7 @@ async def connected(way: str, url: str) -> AsyncIterator[Ask]:
 
 def _score(result: Result) -> float:
     if isinstance(result, ProgressResult):
-        seconds = getattr(result, "remaining_s", None)  # of RynnValue; older commits lack it
+        seconds = getattr(result, "remaining_s", None)  # from RynnValue; older commits lack it
         return result.last_progress if seconds is None else float(seconds[-1])
     return result.preference if isinstance(result, PreferenceResult) else result.similarity
 
@@ -231,7 +231,7 @@ async def measure(ask: Ask, load: Load, sample: Callable[[int], Sample]) -> Call
 
 
 async def main(way: str, url: str, video_dim: int, text_dim: int) -> None:
-    """Apply the loads from standard input until it ends."""
+    """Apply loads from standard input until it ends."""
     async with connected(way, url) as ask:
         while line := await asyncio.to_thread(sys.stdin.readline):
             load = Load(**json.loads(line))

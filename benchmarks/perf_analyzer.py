@@ -31,7 +31,7 @@ from rfm_client.cli.synthetic import write_perf_analyzer_input
 
 WHEEL = "tritonclient==2.51.0"
 LIBRARIES = ("libcudart.so.12", "libb64.so.0d")  # nvidia-pytriton's wheel has them under other names
-# Three windows of one second. 999 % accepts windows that disagree.
+# Three one-second windows. 999 % accepts windows that disagree.
 OPTIONS = ("-i", "grpc", "--async", "-p", "1000", "--max-trials", "3", "--stability-percentage", "999")
 KINDS = {
     "progress, 16 frames": Load(1, 1.5, (16, 16)),
@@ -77,7 +77,7 @@ def main() -> None:
 def _loads(
     load: Load, best: float, concurrency: Sequence[int], poisson: Sequence[float]
 ) -> Iterator[tuple[Load, list[str]]]:
-    """Yield each load for our generator, with perf_analyzer's options for it."""
+    """Yield each load for our generator, with the matching perf_analyzer options."""
     for number in concurrency:
         yield replace(load, callers=number), ["--concurrency-range", str(number)]
     for share in poisson:
@@ -86,7 +86,7 @@ def _loads(
 
 
 def _run(command: Sequence[str], environment: Mapping[str, str]) -> Mapping[str, str]:
-    """Run perf_analyzer, and return the row of its CSV file. Raises RuntimeError if it fails."""
+    """Run perf_analyzer, and return its CSV row. Raises RuntimeError if it fails."""
     with TemporaryDirectory(prefix="rfm-perf-run-") as folder:
         file = Path(folder) / "run.csv"
         words = [*command, "-f", str(file)]
@@ -106,7 +106,7 @@ def _figures(told: Mapping[str, str], best: float, ours: float) -> dict[str, flo
 
 
 def _program(given: Path | None, folder: Path) -> tuple[Path, dict[str, str]]:
-    """Return the path of perf_analyzer, and environment variables that it needs."""
+    """Return the path to perf_analyzer, and the environment variables that it needs."""
     if given is not None:
         return given, {}
     pip = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Checkpoints of a published size with random weights: they cost the time and memory of trained ones.
+"""Random checkpoints with a published size: they cost as much time and memory as trained ones.
 
-Tokenizers are the tests' small ones, which make more tokens of a text than Qwen's. An ordinary Qwen3-VL gets weights
-that make it write "ANSWER: 4", because the length of the answer decides the time of RoboReward.
+Tokenizers are the tests' small ones, which make more tokens from a text than Qwen's. The ordinary Qwen3-VL gets weights
+that make it write "ANSWER: 4", because RoboReward's time depends on the answer's length.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from typing import Any
 import torch
 
 GOLDEN = Path(__file__).parents[1] / "tests" / "golden"
-ROBOMETER, QWEN, RYNNVALUE = "robometer", "qwen", "rynnvalue"  # kinds of a checkpoint
+ROBOMETER, QWEN, RYNNVALUE = "robometer", "qwen", "rynnvalue"  # checkpoint kinds
 DESCRIBED = {"robot_description": "a Franka single-arm robot", "camera_description": "the main right camera"}
-SOURCES = {  # small checkpoints with all other files
+SOURCES = {  # small checkpoints that provide all other files
     ROBOMETER: GOLDEN / "vlm" / "q3_tok_disc10_bf16" / "checkpoint",
     QWEN: GOLDEN / "reward_models" / "roboreward" / "rr_tied_bf16" / "checkpoint",
     RYNNVALUE: GOLDEN / "reward_models" / "rynnvalue" / "bro_symlog_bf16_tied" / "checkpoint",
@@ -30,16 +30,16 @@ BASE_MODEL = GOLDEN / "vlm" / "bases" / "q3"  # Robometer's tokenizer
 PREFIX, EMBEDDING, HEAD = "model.", "model.language_model.embed_tokens.weight", "lm_head.weight"
 SHARDS = ("model-00001-of-00002.safetensors", "model-00002-of-00002.safetensors")
 ANSWER, PROMPT_END = "ANSWER: 4", "\n"
-STD = 0.02  # of the weights
-ADDED_STD = 1e-6  # of the weights that layers end in: a state stays the embedding of its token
+STD = 0.02  # for weights
+ADDED_STD = 1e-6  # for a layer's last weights: a state stays its token's embedding
 SCORE_HEADS = {"progress": 10, "success": 1, "preference": 1}  # outputs
 
 
 @dataclass(frozen=True)
 class Size:
-    """Settings that replace those of the small checkpoints.
+    """Settings that override those in the small checkpoints.
 
-    vocabulary: of the ordinary Qwen3-VL; 0: the small one
+    vocabulary: for the ordinary Qwen3-VL; 0: the small one
     published_heads: True: RynnValue's heads and bins have the published size
     """
 
@@ -71,7 +71,7 @@ QWEN3_VL_4B = Size(
 def write(folder: Path, kind: str, size: Size, device: str = "cpu") -> Path:
     """Write a checkpoint in bfloat16, and return its folder. Weights that all kinds share are written once.
 
-    folder: for the checkpoints of one size
+    folder: for checkpoints with one size
     device: where the weights are drawn
     """
     from safetensors.torch import save_file
@@ -156,7 +156,7 @@ def _value_heads(config: Mapping[str, Any]) -> dict[str, torch.Tensor]:
 
 
 def _answering_head(folder: Path, own: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return an output layer whose largest score after each token of PROMPT_END + ANSWER is that of the next token."""
+    """Return an output layer that predicts PROMPT_END + ANSWER token by token: the next token always scores highest."""
     from transformers import AutoTokenizer
 
     tokenizer = AutoTokenizer.from_pretrained(folder)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Measure networks of a published size without a server: prints a line of JSON for each measurement.
+"""Measure published-size networks without a server: prints a JSON line for each measurement.
 
     real_size.py FOLDER [--tiny]
 
-FOLDER has the checkpoints of random_checkpoints.py. Imports only what exists at older commits, too. Each batch has new
-frames; a measurement lasts a few seconds after the calls that warm up.
+FOLDER has checkpoints from random_checkpoints.py. Imports only what older commits also have. Each batch has new
+frames; a measurement lasts a few seconds after the warm-up calls.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ SHOWN_KERNELS = 12
 
 @dataclass(frozen=True)
 class Scale:
-    """Sizes and durations of the measurements.
+    """Sizes and durations for the measurements.
 
-    small_px, usual_px: heights and widths of frames
-    many_frames: of TOPReward's episode
-    callers: numbers of callers, and of samples in a batch
-    seconds: of a measurement, after warm_up_s
+    small_px, usual_px: frame heights and widths
+    many_frames: frames in TOPReward's episode
+    callers: caller counts, which are also the batch sizes
+    seconds: per measurement, after warm_up_s
     """
 
     size: Size
@@ -64,7 +64,7 @@ def described(px: tuple[int, int], frames: int, callers: int, **more: Any) -> di
 
 
 def measured(engine: Engine, scale: Scale, count: int, frames: int, px: tuple[int, int]) -> dict[str, Any]:
-    """Return rate, latencies and memory of batches of ``count`` samples."""
+    """Return rate, latencies and memory for batches with ``count`` samples."""
     sample = samples(Load(1, 0, (frames, frames), frame_px=px), 0, 0)
     on_gpu = scale.device != "cpu"
     latencies_s: list[float] = []
@@ -92,9 +92,9 @@ def measured(engine: Engine, scale: Scale, count: int, frames: int, px: tuple[in
 
 
 def device_ms(engine: Engine, batch: Sequence[Any]) -> float:
-    """Return the milliseconds in which kernels of a batch run: far fewer than its latency means that the host is slow.
+    """Return how many milliseconds a batch's kernels run: far fewer than its latency means that the host is slow.
 
-    Prints the kernels that take most time to standard error.
+    Prints the slowest kernels to standard error.
     """
     with profile(activities=[ProfilerActivity.CUDA]) as told:
         engine.evaluate(batch)

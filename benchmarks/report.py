@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Results of a benchmark: all rows as JSON, and medians over the rounds as a Markdown table."""
+"""Benchmark results: all rows as JSON, and medians over the rounds as a Markdown table."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Row = Mapping[str, Any]
 
 
 def machine() -> dict[str, object]:
-    """Return the CPU, packages, commit and date of the results."""
+    """Return CPU, packages, commit and date for the results."""
     cpu = next((line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")), "")
     git = shutil.which("git") or "false"  # a bare machine may have none
     commit = subprocess.run([git, "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False).stdout
@@ -49,8 +49,8 @@ def _version(package: str) -> str | None:
 def write(name: str, told: str, rows: Sequence[Row], by: Sequence[str], ratio: str = "", folder: Path = OUTPUT) -> None:
     """Write NAME.json and NAME.md, and print the latter.
 
-    told: a title line, then lines of explanation
-    rows: measurements, each with the number of its ``round``
+    told: a title line, then explanatory lines
+    rows: measurements, each with its ``round`` number
     by: columns that identify a measurement; the last is the way
     ratio: column whose values are divided by the first way's in the same round; empty: none
     """
@@ -66,7 +66,7 @@ def write(name: str, told: str, rows: Sequence[Row], by: Sequence[str], ratio: s
 
 
 def table(rows: Sequence[Row], by: Sequence[str], ratio: str = "") -> list[str]:
-    """Return lines of Markdown: for each way, medians over the rounds, also of its ratio within a round."""
+    """Return Markdown lines: for each way, medians over the rounds, also for its ratio within a round."""
     columns = [name for name in rows[0] if name not in (*by, "round")]
     head = [*by, *columns, *(["ratio"] if ratio else [])]
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Export and serve a checkpoint for a benchmark, with the packages of the Python or checkout that runs this file.
+"""Export and serve a checkpoint for a benchmark, with packages from the Python or checkout that runs this file.
 
     serving.py CHECKPOINT FOLDER SETTINGS
 
-SETTINGS is the section ``export`` as JSON. Prints the server's addresses as a line of JSON as soon as it is ready, and
-serves until standard input ends. Imports only what exists at older commits, too.
+SETTINGS is the ``export`` section as JSON. Prints the server's addresses as a JSON line as soon as it is ready, and
+serves until standard input ends. Imports only what older commits also have.
 """
 
 from __future__ import annotations

@@ -30,7 +30,10 @@ REPOSITORY = Path(__file__).parents[1] / "model_repository"
 
 
 class Clips(NamedTuple):
-    """Clips of a task, each in its own scene. wrong_sentence: a success at another task, with this task's sentence."""
+    """One clip per kind for a task, each in its own scene.
+
+    wrong_sentence: another task's success, with this task's sentence
+    """
 
     success: Clip
     failure: Clip
@@ -40,7 +43,7 @@ class Clips(NamedTuple):
 
     @classmethod
     def of(cls, seed: int) -> Clips:
-        """Return the clips of a seed."""
+        """Make clips from a seed."""
         return cls(
             make_clip("success", TASK, seed),
             make_clip("dropped", TASK, seed + 1),

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Write a dataset of toy-world videos with known outcomes, to label with several checkpoints and compare.
+"""Write toy-world videos with known outcomes, a dataset to label with several checkpoints and compare.
 
     python examples/toy_dataset.py FOLDER
 
-A success and a failure take turns, and so do the tasks and the sorts of failure. Training saw none of the clips.
+Successes and failures alternate; tasks and failure kinds take turns. Training saw none of these clips.
 """
 
 from __future__ import annotations

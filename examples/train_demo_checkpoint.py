@@ -3,7 +3,7 @@
 
     python examples/train_demo_checkpoint.py FOLDER
 
-First the image encoder learns to predict the state of the world and of each task, through a temporary head. Then text
+First the image encoder learns to predict the state of the world and the tasks, through a temporary head. Then text
 encoder and transformer learn progress, success, preference and similarity on its embeddings, with videos rewound as in
 ReWiND (https://arxiv.org/abs/2505.10911). Finally all parts learn together.
 """
@@ -36,14 +36,14 @@ PEAK_LEARNING_RATE = 1.5e-3
 WARMUP_STEPS = 100
 WEIGHT_DECAY = 0.01
 MAX_GRADIENT_NORM = 1.0
-JOINT_ENCODER_SHARE = 0.2  # of the learning rate, for the pretrained image encoder in the joint steps
+JOINT_ENCODER_SHARE = 0.2  # learning rate factor for the pretrained image encoder in the joint steps
 LOG_EVERY = 50
 SAVE_EVERY = 250
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Numbers of steps in which the image encoder learns alone, is frozen, and learns with the other parts."""
+    """How many steps the image encoder learns alone, stays frozen, and learns together with the other parts."""
 
     encoder: int
     frozen: int
@@ -51,13 +51,13 @@ class Plan:
 
     @property
     def total(self) -> int:
-        """Number of all steps."""
+        """Steps in all three stages."""
         return self.encoder + self.frozen + self.joint
 
     def rate(self, step: int) -> float:
-        """Return a step's share of the peak learning rate: warm-up and cosine decay, for each of two stages.
+        """Return a step's share of the peak learning rate: warm-up and cosine decay in each stage.
 
-        The first stage is the encoder's, the second is all other steps.
+        The first stage trains the encoder, the second covers all other steps.
         """
         begin, end = (0, self.encoder) if step < self.encoder else (self.encoder, self.total)
         down = 0.5 * (1 + math.cos(math.pi * (step - begin) / max(end - begin, 1)))
@@ -102,7 +102,7 @@ def train(
 
 
 def _run(learner: Learner, loader: DataLoader[Groups], plan: Plan, folder: Path) -> list[dict[str, float]]:
-    """Train for all steps. Return the mean losses of every LOG_EVERY steps and at the end of each stage."""
+    """Run all steps. Return mean losses for every LOG_EVERY steps and at each stage's end."""
     random = np.random.default_rng(torch.initial_seed())
     optimizer, schedule = _optimizer(learner, plan)
     recent: list[dict[str, float]] = []

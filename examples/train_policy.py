@@ -3,10 +3,10 @@
 
     python examples/train_policy.py
 
-The policy sees the first frame of a scene. It has two colours as parameters. The gripper closes at the columns most
-like the first colour, and opens at the columns most like the second. The cross-entropy method (CEM) tries colours,
-keeps the policies with the highest rewards, and samples around them. The reward of a step is the served model's
-progress of the episode so far. The true state of the world serves only to print success rates.
+The policy sees a scene's first frame. Two colours are its parameters: the gripper closes at the columns most like the
+first colour, and opens at the columns most like the second. The cross-entropy method (CEM) tries colours, keeps the
+policies with the highest rewards, and samples around them. A step's reward is the served model's progress for the
+episode so far. The world's true state serves only to print success rates.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from toy_world import Task, forward, pick_and_place, random_scene, render, resti
 TASK = Task("red", "plate")
 REPOSITORY = Path(__file__).parents[1] / "model_repository"
 FRAMES, ELITES, LEAST_SPREAD = 16, 0.15, 8.0  # colours are 0..255
-TABLE_ROWS = slice(46, 62)  # rows of a frame with blocks, bowl and plate
+TABLE_ROWS = slice(46, 62)  # frame rows that show blocks, bowl and plate
 
 Rewards = Callable[[np.ndarray, range], tuple[np.ndarray, np.ndarray]]
-Policies = np.ndarray  # float64 [P, 2, 3]: RGB of the object to grasp and of the place of release
+Policies = np.ndarray  # float64 [P, 2, 3]: RGB for the object to grasp and for the release point
 
 
 def places(policies: Policies, picture: np.ndarray) -> np.ndarray:
-    """Return float64 [P, 2]: the columns most like each policy's colours, as shares of the width W.
+    """Return the columns that best match each policy's colours, float64 [P, 2], as shares of the width W.
 
     policies: float64 [P, 2, 3]; picture: uint8 [H, W, 3]
     """
     columns = picture[TABLE_ROWS].astype(float)  # [rows, W, 3]
     away = np.abs(columns[None, None] - policies[:, :, None, None]).sum(axis=-1)  # [P, 2, rows, W]
-    looks = np.sort(away, axis=2)[:, :, :4].mean(axis=2)  # distance of the four nearest rows
+    looks = np.sort(away, axis=2)[:, :, :4].mean(axis=2)  # mean distance over the four nearest rows
     smooth = np.apply_along_axis(np.convolve, 2, -looks, np.ones(7) / 7, "same")[:, :, 4:-4]
     return (smooth.argmax(axis=2) + 4.5) / picture.shape[1]
 
 
 def rewards(client: RewardClient, policies: Policies, seeds: range) -> tuple[np.ndarray, np.ndarray]:
-    """Return each policy's mean reward of a step and share of successful episodes, float64 [P] each."""
+    """Return each policy's mean reward per step and its success rate, float64 [P] each."""
     videos, successes = [], []
     for seed in seeds:
         scene = random_scene(TASK, np.random.default_rng(seed))

@@ -41,8 +41,8 @@ from servers import MODEL
 from trajectories import random_trajectory
 
 ENCODERS = ROOT / "model_repository" / "rfm_encoder" / "1"
-MOST_MIB_PER_MIN = 1e6 / 2**20  # largest growth of memory in a soak
-MOST_RISE = 0.25  # of p99 in a soak, as a share of its median; two standard errors or less are chance
+MOST_MIB_PER_MIN = 1e6 / 2**20  # largest memory growth in a soak
+MOST_RISE = 0.25  # for p99 in a soak, relative to its median; up to two standard errors are chance
 
 
 def all_faults(folder: Path, arguments: argparse.Namespace) -> list[Row]:
@@ -75,7 +75,7 @@ def answers(checkpoint: Path, samples: Sequence[Sample]) -> list[Outcome]:
 
 
 def take_turns(folder: Path, arguments: argparse.Namespace) -> list[Row]:
-    """Alternate rollout and rollback under calls over gRPC and HTTP without retry. Each answer names its version."""
+    """Alternate rollout and rollback under gRPC and HTTP calls without retry. Each answer names its version."""
     other, samples = rollout.other_checkpoint(folder / "other"), rollout_samples()
     checkpoints = {"1": rollout.WITH_ENCODERS.checkpoint, "2": other}
     expected = {version: answers(checkpoint, samples) for version, checkpoint in checkpoints.items()}
@@ -117,12 +117,12 @@ def requests(folder: Path, arguments: argparse.Namespace) -> list[Row]:
 
 
 def soak(folder: Path, arguments: argparse.Namespace) -> list[Row]:
-    """Load a server at half of its rate for 30 windows. The first fifth of them warms up."""
+    """Load a server at half its maximum rate for 30 windows. The first fifth is warm-up."""
     minutes, course = [], []
     with site(folder / "soak") as served:
         with served.callers(6) as alone:
             time.sleep(5)
-        pause_s = float(np.median(alone.latencies_s))  # as long as an answer takes: half of the load
+        pause_s = float(np.median(alone.latencies_s))  # one answer time: half the load
         process = psutil.Process(served.served.process.pid)
         with served.callers(6, pause_s=pause_s) as callers, served.gateway_callers(2, pause_s=2 * pause_s) as beside:
             began_s = time.monotonic()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Faults that ``rfm serve`` must survive under load, and the row of ``make chaos`` for each."""
+"""Faults that ``rfm serve`` must survive under load, with one ``make chaos`` row for each."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from servers import MODEL, RFM, START_S, Endpoints, Serving, children, serving, 
 
 CHECKPOINT = ROOT / "model_repository" / "rfm" / "1" / "checkpoint"
 TRITON, OTHER = "triton", f"{MODEL}_b"
-HEALED_S = 10.0  # from a fault to readiness, without the time of a start and the time to detect the fault
+HEALED_S = 10.0  # from fault to readiness, without start time and fault detection time
 CALLERS = 16
 HANG_S = 10
-SILENT_S = 10.0  # the default of rfm serve
+SILENT_S = 10.0  # rfm serve's default
 GONE_S = 5.0  # until all processes of a killed rfm serve have ended
-IDLE = 1300  # connections; more than the usual limit of descriptors, 1024
+IDLE = 1300  # connections; more than the usual descriptor limit, 1024
 DIES = "import os\n\nos._exit(1)\n"
-LOOP_S = 120.0  # six or more starts of Triton
+LOOP_S = 120.0  # six or more Triton starts
 MODEL_FAULTS = answering("""
     for fault in ("hang", "break"):  # once, by the instance that takes the file
         try:
@@ -56,10 +56,10 @@ MODEL_FAULTS = answering("""
 
 @dataclass
 class Row:
-    """Outcomes of the calls under one fault.
+    """Call outcomes under one fault.
 
     healed_s: seconds from the fault to readiness
-    may_lose: number of calls that may fail
+    may_lose: how many calls may fail
     may_break_off: True: calls may be refused, or lose their connection
     broken: messages about broken bounds
     """
@@ -80,7 +80,7 @@ class Row:
             self.expect(self.may_break_off or not untold, f"{untold} calls were refused or broken off")
 
     def expect(self, is_so: bool, otherwise: str) -> None:
-        """Note a broken bound, with the message ``otherwise``, unless ``is_so``."""
+        """Record a broken bound, with the message ``otherwise``, unless ``is_so``."""
         if not is_so:
             self.broken.append(otherwise)
 
@@ -95,7 +95,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Site:
-    """``rfm serve`` with a gateway, and the expected scores. start_s: seconds from start to readiness"""
+    """``rfm serve`` with a gateway, and the expected scores. start_s: seconds from start to readiness."""
 
     served: Serving
     gateway_url: str
@@ -106,7 +106,7 @@ class Site:
 
     @contextmanager
     def callers(self, count: int = CALLERS, *, url: str = "", pause_s: float = 0.0) -> Iterator[Callers]:
-        """Call with the client's default settings and samples of all types."""
+        """Call with the client's default settings and all sample types."""
         with (
             RewardClient(url or self.served.endpoints.grpc_url) as client,
             Callers(direct(client), self.mixed, count, pause_s) as callers,
@@ -146,7 +146,7 @@ class Site:
         return psutil.Process(pid)
 
     def wait_healthy(self) -> float:
-        """Wait until the gateway is healthy; return the seconds that passed."""
+        """Wait until the gateway is healthy; return the elapsed seconds."""
 
         def is_healthy() -> bool:
             with suppress(httpx.TransportError):
@@ -158,9 +158,9 @@ class Site:
 
 @contextmanager
 def site(folder: Path, export: Callable[[Path], object] | None = None, *, to: Path | None = None) -> Iterator[Site]:
-    """Start a server for one fault. A server for all faults would reach six restarts in a row, a crash loop.
+    """Start a server for one fault. A shared server would restart six times in a row, which counts as a crash loop.
 
-    to: as of ``serving``
+    to: as in ``serving``
     """
     folder.mkdir()
     repository, key_file, config = folder / "model_repository", folder / "key", folder / "serve.yaml"
@@ -190,11 +190,11 @@ def export_faulty(repository: Path, folder: Path) -> None:
 def healed(
     name: str, fault: Callable[[Site], object], what: str, noticed_s: float = 0.0, may_lose: int = 0
 ) -> Callable[[Site], list[Row]]:
-    """Return a test of a fault that Triton must be restarted for exactly once.
+    """Return a test for a fault that must cause exactly one restart.
 
     what: the process or model that the supervisor blames
     noticed_s: seconds until the fault can be detected
-    may_lose: number of calls that may fail
+    may_lose: how many calls may fail
     """
 
     def cause(site: Site) -> list[Row]:
@@ -214,7 +214,7 @@ def healed(
 
 
 def crash_loop(site: Site) -> list[Row]:
-    """End Triton repeatedly by one of two models, until ``rfm serve`` ends. The next start serves both again."""
+    """Let one of two models kill Triton repeatedly, until ``rfm serve`` ends. The next start serves both again."""
     trigger = site.trigger("die", OTHER)
     took_s = wait_for(lambda: site.served.process.poll() is not None, LOOP_S)
     trigger.unlink()
@@ -226,7 +226,7 @@ def crash_loop(site: Site) -> list[Row]:
 
 
 def kill_gateway(site: Site) -> list[Row]:
-    """Kill the gateway. Its callers lose their connection; callers of Triton are not affected."""
+    """Kill the gateway. Gateway callers lose their connection; Triton callers are not affected."""
     process = site.gateway
     with site.callers(CALLERS // 2) as beside, site.gateway_callers() as callers:
         process.kill()
@@ -239,7 +239,7 @@ def kill_gateway(site: Site) -> list[Row]:
 
 
 def kill_serve(site: Site) -> list[Row]:
-    """Kill ``rfm serve`` itself. All that it started ends at once, and the next start removes what is left."""
+    """Kill ``rfm serve`` itself. All processes it started end at once, and the next start removes leftovers."""
     processes = psutil.Process(site.served.process.pid).children(recursive=True)
     site.served.process.kill()
     healed_s = wait_for(lambda: all(has_ended(process.pid) for process in processes))
@@ -251,14 +251,14 @@ def kill_serve(site: Site) -> list[Row]:
 
 
 def full_disk(healthy: Site) -> list[Row]:
-    """Kill Triton while nothing that ``rfm serve`` writes finds room."""
+    """Kill Triton while ``rfm serve`` cannot write for lack of disk space."""
     kill = signalled(TRITON, signal.SIGKILL)
     with site(healthy.folder / "full_disk", to=Path("/dev/full")) as without_room:
         return healed("kill -9 of Triton, no room for the log", kill, TRITON)(without_room)
 
 
 def dead_load(site: Site) -> list[Row]:
-    """Roll out a half-copied version, and one whose process dies before its handshake with Triton."""
+    """Roll out a half-copied version, and one whose process dies before the handshake with Triton."""
     rows, repository = [], site.folder / "model_repository"
     for name, program in {"a version without model.py": None, "a process that dies as it loads": DIES}.items():
         version = str(rfm_export.export(CHECKPOINT, repository, ExportConfig(num_gpus=0, torch_threads=1)))
@@ -280,7 +280,7 @@ def dead_load(site: Site) -> list[Row]:
 
 
 def idle_connections(site: Site) -> list[Row]:
-    """Open IDLE connections to the gateway and to each port of Triton, and leave them idle."""
+    """Open IDLE connections to the gateway and to each Triton port, and leave them idle."""
     raise_limit()
     ends, gateway = site.served.endpoints, httpx.URL(site.gateway_url)
     ports = [gateway.port, ends.http_port, ends.grpc_port, ends.metrics_port]
@@ -310,7 +310,7 @@ FAULTS: tuple[Callable[[Site], list[Row]], ...] = (
     healed("kill -9 of Triton", signalled(TRITON, signal.SIGKILL), TRITON),
     healed("SIGSTOP of Triton", signalled(TRITON, signal.SIGSTOP), TRITON, noticed_s=SILENT_S),
     healed(f"a batch hangs (hang_s: {HANG_S})", lambda site: site.trigger("hang"), MODEL, noticed_s=1.1 * HANG_S),
-    # Three failed batches in a row end the model process; callers of the first two get errors.
+    # Three failed batches in a row end the model process; callers in the first two get errors.
     healed("a broken context (simulated)", lambda site: site.trigger("break"), MODEL, may_lose=2 * CALLERS),
     kill_gateway,
     kill_serve,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A MkDocs hook: README.md is the home page, and links to files outside ``docs/`` show the names of these files."""
+"""MkDocs hook: use README.md as the home page, and turn links to files outside ``docs/`` into plain file names."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ VISION_LANGUAGE = (
     " families/test_frame_threads.py families/test_rynnvalue.py families/test_topreward.py families/test_roboreward.py"
     " families/test_lerobot_robometer.py export/test_provenance.py"
 )
-# Mutated files, and their tests: at least one test must fail.
+# Files to mutate, and their tests: at least one test must fail.
 PARTS = {
     "client/rfm_client/contract/wire/*.py": "contract/test_*.py families/test_properties.py",
     "rfm/engine/layers.py": "families/test_layers.py families/test_rewind.py families/test_encoders.py",
@@ -56,11 +56,11 @@ name = "local"
 
 [cosmic-ray.filters.operators-filter]
 exclude-operators = ["core/ReplaceBinaryOperator_BitOr_.*", "core/RemoveDecorator", "core/ExceptionReplacer"]
-"""  # "|" is in annotations
+"""  # "|" occurs in annotations
 
 
 def start(pattern: str, folder: Path) -> Path:
-    """Return a clone with a cosmic-ray session of a part's mutants. Raises RuntimeError if no file matches."""
+    """Clone the repository, with a cosmic-ray session for a part's mutants. Raises RuntimeError if no file matches."""
     subprocess.run(["git", "clone", "--quiet", "--shared", ROOT, folder], check=True)
     modules = [str(file.relative_to(folder)) for file in sorted(folder.glob(pattern)) if file.name != "__init__.py"]
     if not modules:
@@ -74,7 +74,7 @@ def start(pattern: str, folder: Path) -> Path:
 
 
 def run(folder: Path, program: str, *words: str) -> str:
-    """Run a program of cosmic-ray, and return its output. Tests import the packages of the clone."""
+    """Run a cosmic-ray program, and return its output. Tests import packages from the clone."""
     imported = [
         folder / name
         for name in (".", "client", "apps/gateway", "apps/labels", "apps/page", "apps/rl", "export", "commands")
@@ -87,7 +87,7 @@ def run(folder: Path, program: str, *words: str) -> str:
 
 
 def sample(folder: Path, database: WorkDB, share: float, seed: int) -> None:
-    """Skip all but a random share of the mutants, and every mutant of an assert or raise statement."""
+    """Skip mutants in assert and raise statements, and all but a random share of the rest."""
     pending: list[WorkItem] = list(database.pending_work_items)
     sources = {
         path: (folder / path).read_text().splitlines() for path in {one.mutations[0].module_path for one in pending}

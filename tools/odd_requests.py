@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Malformed requests of ``make chaos``. The servers must survive, and answer other callers."""
+"""Malformed requests for ``make chaos``. Servers must survive them and still answer other callers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def against_gateway(url: str, examples: int, seed: int) -> bool:
 
 
 def messages(widths: tuple[int, int]) -> list[bytes]:
-    """Return valid gRPC requests: progress of embeddings, a preference, and progress of frames."""
+    """Return valid gRPC requests: progress from embeddings, a preference, and progress from frames."""
     frames = np.random.default_rng(0).integers(0, 256, (2, 24, 24, 3), np.uint8)
     first, second = random_trajectory(0, 4, *widths), random_trajectory(1, 5, *widths)
     filmed = Trajectory(frames=frames, task="stack the cups")
@@ -47,7 +47,7 @@ def messages(widths: tuple[int, int]) -> list[bytes]:
 
 
 def spoilt(message: bytes, choose: random.Random) -> bytes:
-    """Return the message with some bytes changed, added or removed."""
+    """Corrupt the message: change, add or remove some bytes."""
     changed = bytearray(message)
     for _ in range(choose.choice((1, 2, 8))):
         at, length = choose.randrange(len(changed)), choose.choice((0, 1, 8, 64))
@@ -56,7 +56,7 @@ def spoilt(message: bytes, choose: random.Random) -> bytes:
 
 
 def against_triton(url: str, widths: tuple[int, int], count: int, seed: int) -> Counter[str]:
-    """Send ``count`` spoilt messages; return how often each status came. tests/families has valid but odd tensors."""
+    """Send ``count`` corrupted messages and count the status codes. tests/families has valid but odd tensors."""
     choose, codes, whole = random.Random(seed), Counter[str](), messages(widths)
     with grpc.insecure_channel(url.removeprefix("grpc://")) as channel:
         call = channel.unary_unary("/inference.GRPCInferenceService/ModelInfer")

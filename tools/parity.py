@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``make parity``: score every reference case with Triton, and compare the scores with upstream's."""
+"""``make parity``: score every reference case with Triton, and compare with upstream's scores."""
 
 from __future__ import annotations
 

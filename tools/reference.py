@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""``make reference``: write the lists of docs/reference that come from the code.
+"""``make reference``: update the lists in docs/reference that are generated from code.
 
-``--check`` writes nothing and fails if a list is out of date. A list stands between ``<!-- NAME: made by make reference -->`` and ``<!-- end -->``.
+``--check`` writes nothing and fails if a list is outdated. Lists stand between
+``<!-- NAME: made by make reference -->`` and ``<!-- end -->``.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from rfm_commands.config import FASTAPI_KEYS, SECTIONS
 
 DOCUMENTS = sorted((Path(__file__).parents[1] / "docs" / "reference").glob("*.md"))
 BLOCK = re.compile(r"(<!-- ([\w ]+): made by make reference -->\n).*?(<!-- end -->)", re.DOTALL)
-MEANING = re.compile(r"^ *(\w+): (.*)", re.MULTILINE)  # a line of a docstring
+MEANING = re.compile(r"^ *(\w+): (.*)", re.MULTILINE)  # a docstring line
 
 
 def current(file: Path) -> str:
-    """Return the text of a document with lists as the code has them now. Raises KeyError for an unknown list."""
+    """Return a document's text with up-to-date lists. Raises KeyError for an unknown list."""
     return BLOCK.sub(lambda found: f"{found[1]}\n{LISTS[found[2]]()}\n{found[3]}", file.read_text())
 
 
@@ -34,7 +35,7 @@ def _section(kind: type[Settings]) -> str:
 
 
 def _key(key: str, setting: Setting) -> str:
-    """A key as the list names it, with the option if that is not the key with dashes."""
+    """Format a key, with its option if that is not the key with dashes."""
     if setting.has_option and setting.option == f"--{key.replace('_', '-')}":
         return f"`{key}`"
     return f"`{key}` (`{setting.option}`)" if setting.has_option else f"`{key}` (no option)"
@@ -46,14 +47,14 @@ def _meaning(setting: Setting) -> str:
 
 
 def _text(value: Any) -> str:
-    """A value as the file spells it; empty for none."""
+    """Format a value as in the file; empty for none."""
     if value is None or value is MISSING or value == ():
         return ""
     return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _run_settings() -> str:
-    """The settings of a vision-language checkpoint that its run's config.yaml decides."""
+    """Settings that a vision-language checkpoint takes from its run's config.yaml."""
     meanings = {
         name: meaning for kind in reversed(VlmConfig.__mro__) for name, meaning in MEANING.findall(kind.__doc__ or "")
     }
@@ -74,7 +75,7 @@ LISTS: dict[str, Callable[[], str]] = {
 
 
 def main(check: bool) -> None:
-    """Write the lists, or exit with the names of documents whose lists are out of date."""
+    """Write the lists, or exit with the names of outdated documents."""
     changed = {file: text for file in DOCUMENTS if (text := current(file)) != file.read_text()}
     if check and changed:
         sys.exit(

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Write a ``tritonserver`` that serves with this Python's packages, for tests that run with those of another Python.
+"""Write a ``tritonserver`` that uses this Python's packages, for tests that run under another Python.
 
-The Triton of the wheel needs numpy 1. Tests with numpy 2 find this program in PATH.
+The Triton wheel needs numpy 1. Tests with numpy 2 find this program in PATH.
 
 python tools/tritonserver.py FOLDER
 """

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Clients of the peers, for a load generator.
+"""Clients for the peers, used by a load generator.
 
-Each factory takes a session and the server's address. It returns a coroutine function that scores samples of embeddings
-together: progress at the last frame, preference or similarity of each. It raises an error if a sample has no score.
+Each factory takes a session and the server's address. It returns a coroutine function that scores embedding samples
+together: progress at the last frame, preference or similarity. It raises an error if a sample has no score.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ KINDS: dict[type, str] = {
     PreferenceSample: "preference",
     SimilaritySample: "similarity",
 }
-NAMES: dict[type, tuple[str, ...]] = {  # the evaluation server's names of their trajectories
+NAMES: dict[type, tuple[str, ...]] = {  # what the evaluation server calls their trajectories
     ProgressSample: ("trajectory",),
     PreferenceSample: ("chosen_trajectory", "rejected_trajectory"),
     SimilaritySample: ("ref_trajectory", "sim_trajectory"),
@@ -35,7 +35,7 @@ _MSGPACK = {"Content-Type": "application/msgpack"}
 
 
 def fastapi_npy(session: aiohttp.ClientSession, base_url: str) -> Ask:
-    """Return a client of the FastAPI evaluation server, or of our gateway, with .npy files in a form."""
+    """Return a client for the FastAPI evaluation server, or for our gateway, with .npy files in a form."""
 
     async def ask(samples: Sequence[Sample]) -> list[float]:
         async with session.post(f"{base_url}/evaluate_batch_npy", data=_form(samples)) as answer:
@@ -46,7 +46,7 @@ def fastapi_npy(session: aiohttp.ClientSession, base_url: str) -> Ask:
 
 
 def by_msgpack(session: aiohttp.ClientSession, url: str) -> Ask:
-    """Return a client of the mosec server, with a message for each sample (see ``engines``)."""
+    """Return a client for the mosec server, with one message per sample (see ``engines``)."""
 
     async def ask_one(sample: Sample) -> float:
         videos = [_video(trajectory) for trajectory in sample.trajectories]
@@ -99,7 +99,7 @@ def _form(samples: Sequence[Sample]) -> aiohttp.FormData:
 
 
 def _scores(samples: Sequence[Sample], outputs: Mapping[str, Any]) -> list[float]:
-    """Return the scores in order of the samples. The evaluation server's answer has a list for each sample type."""
+    """Return the scores in sample order. The evaluation server answers with one list per sample type."""
     told = {
         "progress": (values[-1] for values in (outputs["outputs_progress"] or {}).get("progress_pred", ())),
         "preference": iter((outputs["outputs_preference"] or {}).get("prediction_probs", ())),

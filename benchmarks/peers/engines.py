@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Messages and engine of the mosec server.
+"""Messages and engine for the mosec server.
 
-T frames, D width of a frame embedding, Dt width of a text embedding.
+T frames, D frame embedding width, Dt text embedding width.
 
-A message is a msgpack map for a sample, with arrays as float32 bytes. Request: ``type`` (progress, preference or
-similarity), ``shapes`` ([T, D] of each trajectory), ``video`` (their embeddings in sequence) and ``text`` (the first
-trajectory's [Dt]). Answer: ``progress`` and ``success`` (float32 [T] of each trajectory), and for pairs ``query``; or
+A message is a msgpack map for one sample, with arrays as float32 bytes. Request: ``type`` (progress, preference or
+similarity), ``shapes`` ([T, D] per trajectory), ``video`` (the trajectories' embeddings in sequence) and ``text`` (the
+first trajectory's [Dt]). Answer: ``progress`` and ``success`` (float32 [T] per trajectory), and for pairs ``query``; or
 ``error``.
 """
 
@@ -36,7 +36,7 @@ _PAIRS = {"preference": PreferenceSample, "similarity": SimilaritySample}
 
 
 def options(told: str | None) -> argparse.Namespace:
-    """Return the options of a peer's command line."""
+    """Parse a peer's command-line options."""
     parser = argparse.ArgumentParser(description=told, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkpoint", required=True, help="checkpoint folder")
     parser.add_argument("--port", type=int, required=True)
@@ -45,7 +45,7 @@ def options(told: str | None) -> argparse.Namespace:
 
 
 def sample_of(message: Mapping[str, Any]) -> Sample:
-    """Return the sample of a request. Raises KeyError, ValueError, InvalidSampleError."""
+    """Return the sample in a request. Raises KeyError, ValueError, InvalidSampleError."""
     text = np.frombuffer(message["text"], np.float32)
     video = np.frombuffer(message["video"], np.float32)
     shapes = message["shapes"]
@@ -76,5 +76,5 @@ def _frames(*scores: FrameScores) -> dict[str, Any]:
 
 
 def engine_of(checkpoint: str) -> Engine:
-    """Return the engine of a checkpoint, on the CPU."""
+    """Load a checkpoint's engine on the CPU."""
     return Engine.of(published.load(checkpoint))

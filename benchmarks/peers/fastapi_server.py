@@ -27,7 +27,7 @@ from upstream_forward import Scores, UpstreamRewind, load, progress_of
 from engines import options
 
 UPLOAD_KEY = "__numpy_file__"
-TRAJECTORIES = {  # of each sample type, in the network's order
+TRAJECTORIES = {  # for each sample type, in the network's order
     "progress": ("trajectory",),
     "preference": ("chosen_trajectory", "rejected_trajectory"),
     "similarity": ("ref_trajectory", "sim_trajectory"),
@@ -37,7 +37,7 @@ Json = Mapping[str, Any]
 
 
 class ReplicaPool:
-    """Replicas, each checked out for a request at a time, and the threads that score."""
+    """Replicas, each checked out for one request at a time, and the threads that score."""
 
     def __init__(self, replicas: Sequence[UpstreamRewind], max_workers: int) -> None:
         self._replicas: Queue[UpstreamRewind] = Queue()
@@ -78,7 +78,7 @@ def create_app(pool: ReplicaPool) -> FastAPI:
 
 
 def _merged(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Return the value with uploaded arrays in place of their names."""
+    """Replace array names in the value with the uploaded arrays."""
     if not isinstance(value, dict):
         return value
     if UPLOAD_KEY in value:
@@ -88,7 +88,7 @@ def _merged(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 
 @torch.inference_mode()
 def _score(network: UpstreamRewind, samples: Sequence[Json]) -> Json:
-    """Return the answer to a request, with a forward pass for each sample type."""
+    """Return the answer to a request, with one forward pass per sample type."""
     outputs = ("outputs_preference", "outputs_progress", "outputs_success", "outputs_similarity")
     answer: dict[str, Any] = dict.fromkeys(outputs)
     for kind in TRAJECTORIES:
@@ -107,7 +107,7 @@ def _score(network: UpstreamRewind, samples: Sequence[Json]) -> Json:
 
 
 def _forward(network: UpstreamRewind, samples: Sequence[Json], kind: Any) -> Scores:
-    """Return raw scores of samples of one type. Raises RuntimeError for trajectories of unequal lengths."""
+    """Return raw scores for samples with one type. Raises RuntimeError if trajectory lengths differ."""
     sides = [[sample[name] for sample in samples] for name in TRAJECTORIES[kind]]
     text = _stacked(trajectory["text_embedding"] for trajectory in sides[0])
     videos = [_stacked(trajectory["video_embeddings"] for trajectory in side) for side in sides]

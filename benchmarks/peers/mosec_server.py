@@ -35,7 +35,7 @@ class RewardWorker(MsgpackMixin, mosec.Worker):
         self.engine = engine_of(os.environ["PEER_CHECKPOINT"])
 
     def forward(self, data: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """Return the answer to each request of a batch."""
+        """Return the answer to each request in a batch."""
         return [answer_of(outcome) for outcome in self.engine.evaluate([sample_of(message) for message in data])]
 
 

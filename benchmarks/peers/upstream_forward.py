@@ -2,9 +2,8 @@
 """Upstream's ReWiND forward pass in stock torch modules, as the FastAPI evaluation server runs it for each request.
 
 Follows upstream's code: ``nn.TransformerEncoder``, a causal mask built on every call, progress tokens interleaved by
-stacking, and rows of equal length. The state dict has the checkpoint's names.
-B rows, T frames of a trajectory, L tokens, D width, Dv width of a frame embedding, Dt width of a text embedding, K
-progress bins.
+stacking, and rows with equal length. State dict names match the checkpoint's.
+B rows, T frames per trajectory, L tokens, D width, Dv frame embedding width, Dt text embedding width, K progress bins.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ SampleType = Literal["progress", "preference", "similarity"]
 
 
 class Scores(NamedTuple):
-    """Raw scores: logits of progress [B, T, K] and success [B, T]; for pairs also the second's, and query [B]."""
+    """Raw scores: progress logits [B, T, K] and success logits [B, T]; for pairs also the second's, and query [B]."""
 
     progress: Tensor
     success: Tensor
@@ -43,7 +42,7 @@ def _head(width: int, num_outputs: int) -> nn.Sequential:
 
 
 class UpstreamRewind(nn.Module):
-    """The network of a ReWiND checkpoint."""
+    """The network in a ReWiND checkpoint."""
 
     def __init__(self, config: RewindConfig) -> None:
         super().__init__()
@@ -72,9 +71,9 @@ class UpstreamRewind(nn.Module):
     def forward(
         self, text: Tensor, first: Tensor, second: Tensor | None = None, sample_type: SampleType = "progress"
     ) -> Scores:
-        """Return the scores of text [B, Dt], first [B, T, Dv] and, for pairs, second [B, T, Dv].
+        """Score text [B, Dt], first [B, T, Dv] and, for pairs, second [B, T, Dv].
 
-        Raises ValueError if the shapes of first and second differ.
+        Raises ValueError if first and second differ in shape.
         """
         text_token = self.text_proj(text).unsqueeze(1)
         if self.config.use_per_frame_progress_token:
@@ -97,7 +96,7 @@ class UpstreamRewind(nn.Module):
         return Scores(*self._frame_scores(of_first), *self._frame_scores(of_second), query)
 
     def _trajectory_tokens(self, video: Tensor, which: Literal["A", "B"]) -> Tensor:
-        """Map [B, T, Dv] to [B, T, D], or to [B, 2T, D] with a progress token behind each frame."""
+        """Map [B, T, Dv] to [B, T, D], or to [B, 2T, D] with a progress token after each frame."""
         frames = self.video_proj(video)
         first_embedding = self.first_embedding_A if which == "A" else self.first_embedding_B
         frames = torch.cat([frames[:, :1] + first_embedding, frames[:, 1:]], dim=1)
@@ -116,13 +115,13 @@ class UpstreamRewind(nn.Module):
         return self.transformer(tokens, mask=mask)
 
     def _frame_scores(self, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Return logits of progress [B, T, K] and success [B, T] from a trajectory's tokens [B, T or 2T, D]."""
+        """Return progress logits [B, T, K] and success logits [B, T] from a trajectory's tokens [B, T or 2T, D]."""
         read = hidden[:, 1::2] if self.config.use_per_frame_progress_token else hidden
         return self.progress_head(read), self.success_head(read).squeeze(-1)
 
 
 def progress_of(logits: Tensor) -> Tensor:
-    """Return progress [..., T], 0 to 1, of logits [..., T, K]: bins' mean under the softmax; K = 1: sigmoid."""
+    """Convert logits [..., T, K] to progress [..., T], 0 to 1: mean bin under the softmax; K = 1: sigmoid."""
     if logits.shape[-1] == 1:
         return logits.squeeze(-1).sigmoid()
     bins = torch.linspace(0, 1, logits.shape[-1], device=logits.device)
@@ -130,7 +129,7 @@ def progress_of(logits: Tensor) -> Tensor:
 
 
 def load(folder: str | Path) -> UpstreamRewind:
-    """Return the network of a ReWiND checkpoint folder, on the CPU. Raises CheckpointError, TypeError."""
+    """Load the network from a ReWiND checkpoint folder, on the CPU. Raises CheckpointError, TypeError."""
     checkpoint = load_checkpoint(folder)
     if not isinstance(checkpoint, RewindCheckpoint):
         raise TypeError(f"{folder}: expected a ReWiND checkpoint, got {type(checkpoint).__name__}")

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Training of the demo's checkpoint: data, networks, losses."""
+"""Train the demo's checkpoint: data, networks, losses."""

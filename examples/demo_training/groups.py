@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Training data: groups of related clips, rendered on demand.
 
-G groups, 4 clips a group (the constants below), T frames a clip, H x W pixels, 6 tasks, S values of hints.
+G groups, 4 clips per group (the constants below), T frames per clip, H x W pixels, 6 tasks, S hint values.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from toy_world.scene import random_scene
 from toy_world.tasks import COLOURS, TARGETS, TASKS, Task
 
 CLIP_FRAMES = 12
-SCATTERED_FRAMES = 3  # of a clip while the encoder learns alone: few, so that it sees many scenes
-SUCCESS, SECOND_SUCCESS, FAILURE, OTHER_TASK = range(4)  # the clips of a group
+SCATTERED_FRAMES = 3  # per clip while the encoder learns alone: few, so that it sees many scenes
+SUCCESS, SECOND_SUCCESS, FAILURE, OTHER_TASK = range(4)  # the clips in a group
 HINT_DIM = 3 + 4 * len(COLOURS) + len(TARGETS) + 2 * len(TASKS)
 _SAME_SCENE_SHARE = 0.5
 
 
 class Groups(NamedTuple):
-    """Clips of G groups, with their true scores.
+    """G groups of clips, with their true scores.
 
     frames: uint8 [G, 4, T, H, W, 3]
-    task, other_task: int64 [G], tasks of the clips SUCCESS and OTHER_TASK
+    task, other_task: int64 [G], tasks for the clips SUCCESS and OTHER_TASK
     progress, success: float32 [G, 4, T, 6], true scores under each task
-    hints: float32 [G, 4, T, S], state in a frame: positions (NaN for a missing block), then progress and success of
+    hints: float32 [G, 4, T, S], state in a frame: positions (NaN for a missing block), then progress and success for
         each task
     """
 
@@ -49,9 +49,9 @@ class Groups(NamedTuple):
 
 @dataclass(frozen=True)
 class GroupsDataset(Dataset[Groups]):
-    """``num_steps`` batches of ``groups_per_step`` groups. A seed gives the same groups in any process.
+    """Yields ``num_steps`` batches with ``groups_per_step`` groups. A seed gives the same groups in any process.
 
-    In the first ``scattered_steps``, the same number of frames comes from more groups, SCATTERED_FRAMES of each clip.
+    The first ``scattered_steps`` batches hold equally many frames, from more groups with SCATTERED_FRAMES per clip.
     """
 
     seed: int

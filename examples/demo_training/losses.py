@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Questions about a batch of groups, and the losses of their answers.
+"""Training questions about a batch of groups, and losses for the answers.
 
 Each clip is embedded once. Rows reuse the embeddings: played forwards, rewound or stopped, under any task.
-G groups, R rows, T frames of a row or a clip, H x W pixels, K progress bins, Dv width of a frame embedding, Dt width of
-a text embedding, S values of hints.
+G groups, R rows, T frames per row or clip, H x W pixels, K progress bins, Dv frame embedding width, Dt text embedding
+width, S hint values.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from demo_training.networks import Learner
 from rfm.families.rewind.network import RewindBatch
 from toy_world.tasks import TASKS, VERBS
 
-LENGTHS = (4, 17)  # range of frames of a row, without the upper bound
+LENGTHS = (4, 17)  # frames per row, without the upper bound
 _LONG_ROWS_SHARE, _LONGEST = 0.2, 33
-_PLACE_WEIGHT, _TASK_WEIGHT = 3.0, 8.0  # of the hints on the state of the world, and on progress and success
+_PLACE_WEIGHT, _TASK_WEIGHT = 3.0, 8.0  # for hints about the world's state, and about progress and success
 _SUCCESS_POSITIVE_WEIGHT = 2.0
 
-# Rows: (clip, playback, task). "any": a random task of all six.
+# Rows: (clip, playback, task). "any": a random task out of all six.
 _SINGLES = (
     (SUCCESS, "forward", "own"),
     (SUCCESS, "forward", "other"),
@@ -40,8 +40,8 @@ _SINGLES = (
     (OTHER_TASK, "forward", "other"),
     (OTHER_TASK, "forward", "any"),
 )
-NOISE, OTHER_NOISE, RANDOM, OTHER_RANDOM = range(4, 8)  # clips without a scene: frames of noise, random embeddings
-_NOISE_FRAMES = 6  # of a noise clip, repeated to CLIP_FRAMES
+NOISE, OTHER_NOISE, RANDOM, OTHER_RANDOM = range(4, 8)  # clips without a scene: noise frames, random embeddings
+_NOISE_FRAMES = 6  # per noise clip, repeated to CLIP_FRAMES
 
 # (first clip, playback, second clip, playback): the first is better.
 _PREFERENCES = (
@@ -53,13 +53,13 @@ _PREFERENCES = (
     (SECOND_SUCCESS, "forward", SUCCESS, "stopped"),
     (SUCCESS, "forward", NOISE, "forward"),
 )
-# Neither is better, in either order. The last pair has random text embeddings, too.
+# Neither is better, in either order. The last pair also has random text embeddings.
 _UNDECIDED = (
     (SUCCESS, "forward", SECOND_SUCCESS, "forward"),
     (NOISE, "forward", OTHER_NOISE, "forward"),
     (RANDOM, "forward", OTHER_RANDOM, "forward"),
 )
-# (reference, other, 1 for the same task done)
+# (reference, other, 1 if the same task is done)
 _SIMILARITIES = (
     (SUCCESS, SECOND_SUCCESS, 1.0),
     (SECOND_SUCCESS, SUCCESS, 1.0),
@@ -70,7 +70,7 @@ _SIMILARITIES = (
 
 
 class _Video(NamedTuple):
-    """A trajectory of each of R rows: embeddings float32 [R, T, Dv], progress and success float32 [R, T]."""
+    """R trajectories: embeddings float32 [R, T, Dv], progress and success float32 [R, T]."""
 
     embeddings: Tensor
     progress: Tensor
@@ -81,8 +81,8 @@ class _Video(NamedTuple):
 class Questions:
     """Draws questions about groups.
 
-    embeddings: float32 [G, 8, T, Dv], of the groups' 4 clips and 4 clips without a scene
-    texts: float32 [6, Dt], of the tasks
+    embeddings: float32 [G, 8, T, Dv], for the groups' 4 clips and 4 clips without a scene
+    texts: float32 [6, Dt], for the tasks
     """
 
     groups: Groups
@@ -91,7 +91,7 @@ class Questions:
     random: np.random.Generator
 
     def losses(self, learner: Learner) -> dict[str, Tensor]:
-        """Return the mean loss of each kind of answer."""
+        """Return the mean loss for each kind of answer."""
         losses = self._single_losses(learner)
         for name, loss in self._pair_losses(learner).items():
             losses[name] = losses.get(name, torch.zeros(())) + loss
@@ -154,7 +154,7 @@ class Questions:
         return losses | {"preference": answers[~is_similarity].mean(), "similarity": answers[is_similarity].mean()}
 
     def _video(self, clip: int, how: str, task: Tensor, length: int) -> _Video:
-        """Return a trajectory of each group. how: ``forward``, ``stopped`` or ``rewound``"""
+        """Return one trajectory per group. how: ``forward``, ``stopped`` or ``rewound``."""
         moments = torch.from_numpy(np.stack([_moments(how, length, self.random) for _ in range(len(task))]))
         groups = torch.arange(len(task))[:, None]
         truths = (truth[groups, clip, moments, task[:, None]] for truth in (self.groups.progress, self.groups.success))
@@ -175,7 +175,7 @@ class Questions:
 
 
 def noise_clips(num_groups: int, size_px: tuple[int, int], random: np.random.Generator) -> Tensor:
-    """Return clips of noise of random grain, contrast and brightness, uint8 [G, 2, 6, H, W, 3].
+    """Return noise clips with random grain, contrast and brightness, uint8 [G, 2, 6, H, W, 3].
 
     size_px: H and W
     """
@@ -194,7 +194,7 @@ def with_noise(groups: Groups, embeddings: Tensor, noise: Tensor) -> tuple[Group
     """Add clips without a scene, which have no progress and no success, to groups and embeddings.
 
     embeddings: float32 [G, 4, T, Dv]; in the result [G, 8, T, Dv]
-    noise: float32 [G, 2, 6, Dv], embeddings of ``noise_clips``
+    noise: float32 [G, 2, 6, Dv], embeddings from ``noise_clips``
     """
     shown = noise.repeat(1, 1, CLIP_FRAMES // _NOISE_FRAMES, 1)
     embeddings = torch.cat([embeddings, shown, torch.randn_like(shown)], dim=1)
@@ -204,7 +204,7 @@ def with_noise(groups: Groups, embeddings: Tensor, noise: Tensor) -> tuple[Group
 
 
 def hint_loss(learner: Learner, embeddings: Tensor, hints: Tensor) -> Tensor:
-    """Return the loss, float32 [], of hints, float32 [..., S], read from embeddings, float32 [..., Dv]."""
+    """Return the loss, float32 [], for hints, float32 [..., S], read from embeddings, float32 [..., Dv]."""
     read = learner.hint_head(embeddings)
     errors = (read - torch.where(hints.isnan(), read.detach(), hints)).square()
     num_tasks = 2 * len(TASKS)
@@ -212,7 +212,7 @@ def hint_loss(learner: Learner, embeddings: Tensor, hints: Tensor) -> Tensor:
 
 
 def drawn_verb(random: np.random.Generator) -> str:
-    """Return a random verb of VERBS."""
+    """Return a random verb from VERBS."""
     return str(random.choice(VERBS))
 
 
@@ -226,13 +226,13 @@ def _frame_losses(progress_logits: Tensor, success_logits: Tensor, video: _Video
 
 
 def _two_hot(progress: Tensor, bins: int) -> Tensor:
-    """Map progress [R, T] to bin weights [R, T, K]: the two nearest bins, with the progress as their mean."""
+    """Map progress [R, T] to bin weights [R, T, K]: two neighbouring bins, weighted to average the progress."""
     position = progress * (bins - 1)
     return F.relu(1 - (position[..., None] - torch.arange(bins)).abs())
 
 
 def _moments(how: str, length: int, random: np.random.Generator) -> np.ndarray:
-    """Return int64 [length]: a row's frames, as indices into a clip of CLIP_FRAMES."""
+    """Return int64 [length]: a row's frames, as indices into a clip with CLIP_FRAMES frames."""
     last = CLIP_FRAMES - 1
     if how == "stopped":
         last = int(random.integers(1, CLIP_FRAMES - 4))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The demo checkpoint's networks: small served networks, and a head for training alone.
+"""The demo checkpoint's networks: small served networks, and a head used only in training.
 
-H x W pixels, Dv width of a frame embedding, Dt width of a text embedding.
+H x W pixels, Dv frame embedding width, Dt text embedding width.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ TEXT_DIM = 32
 MAX_TASK_TOKENS = 128
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-_INIT_STD = 0.1  # about 1 / sqrt(width); with the 0.02 of large models, narrow networks learn too slowly at first
+_INIT_STD = 0.1  # about 1 / sqrt(width); with large models' 0.02, narrow networks learn too slowly at first
 _TEXT_GAIN = 6.0
 
 CONFIG = RewindConfig(
@@ -61,12 +61,12 @@ class Learner(nn.Module):
         self.eval()  # no dropout: the networks are small, and data never repeat
 
     def embed_frames(self, frames: Tensor) -> Tensor:
-        """Embed frames, uint8 [..., H, W, 3], as ``Encoders`` does, with gradients: float32 [..., Dv]."""
+        """Embed frames, uint8 [..., H, W, 3], like ``Encoders``, but with gradients: float32 [..., Dv]."""
         crops = self.encoders.preprocessor(frames.flatten(0, -4))
         return self.image_model(pixel_values=crops).pooler_output.unflatten(0, frames.shape[:-3])
 
     def embed_tasks(self, verb: str) -> Tensor:
-        """Embed the sentences of TASKS with ``verb``, as ``Encoders`` does, with gradients: float32 [6, Dt]."""
+        """Embed the TASKS sentences with ``verb``, like ``Encoders``, but with gradients: float32 [6, Dt]."""
         sentences = [task.sentence(verb) for task in TASKS]
         tokens = self.encoders.tokenizer(sentences, padding=True, return_tensors="pt")
         hidden = self.text_model(**tokens).last_hidden_state
@@ -108,7 +108,7 @@ def write_checkpoint(learner: Learner, folder: Path) -> None:
 
 
 def num_parameters(module: nn.Module) -> int:
-    """Return the number of a module's parameters."""
+    """Return a module's parameter count."""
     return sum(parameter.numel() for parameter in module.parameters())
 
 
@@ -165,6 +165,6 @@ def _tokenizer() -> Any:
 
 
 def seeded_learner(seed: int) -> Learner:
-    """Return the networks of a seed."""
+    """Initialise the networks from a seed."""
     torch.manual_seed(seed)
     return Learner()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Clips to score, with the truth about them."""
+"""Clips to score, with the true scores."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from toy_world.scene import Float64Array, Scene, random_scene
 from toy_world.tasks import Task
 
 NUM_FRAMES = 16
-_TURN_SHARES = (0.7, 1.0)  # of an episode, where it may turn back
-_MIN_REWOUND_SHARE = 0.35  # of an episode, how much is rewound at least
+_TURN_SHARES = (0.7, 1.0)  # where an episode may turn back, as a share of its length
+_MIN_REWOUND_SHARE = 0.35  # minimum rewound share
 
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """frames: uint8 [T, H, W, 3]; progress: float64 [T], success: bool [T], the truth for ``task``.
+    """A clip with the true scores for ``task``.
 
-    task: what is asked for; a video of another task makes it a clip under the wrong sentence
-    turn: the frame from which the clip runs backwards; T - 1 in one that does not
+    frames: uint8 [T, H, W, 3]; progress: float64 [T], success: bool [T]
+    task: the task in the sentence; the video may show another one
+    turn: the frame from which the clip runs backwards; T - 1 if it never does
     """
 
     frames: UInt8Array
@@ -36,9 +37,9 @@ class Clip:
 
 
 def make_clip(kind: str, task: Task, seed: int, *, shown: Task | None = None, num_frames: int = NUM_FRAMES) -> Clip:
-    """A clip of one of KINDS or ``rewound``, always the same for the same arguments.
+    """Make a clip; ``kind`` is one of KINDS or ``rewound``. Deterministic in the arguments.
 
-    shown: the task that the video is about, if not ``task``
+    shown: the task that the video shows, if not ``task``
     """
     random = np.random.default_rng(seed)
     shown = shown or task
@@ -51,14 +52,14 @@ def make_clip(kind: str, task: Task, seed: int, *, shown: Task | None = None, nu
 
 
 def forward(episode: Episode, num_frames: int) -> Episode:
-    """So many moments, evenly."""
+    """Sample ``num_frames`` evenly spaced moments."""
     return episode.at(np.linspace(0, len(episode) - 1, num_frames).round().astype(np.int64))
 
 
 def rewound(episode: Episode, num_frames: int, random: np.random.Generator) -> tuple[Episode, int]:
-    """So many moments of the episode as it runs forwards and then back, and the frame of the turn.
+    """Play an episode forwards, then back, in ``num_frames`` moments. Return it with the frame where it turns.
 
-    ReWiND (https://arxiv.org/abs/2505.10911) trains on such videos: they fail in a way that needs no failed episode.
+    ReWiND (https://arxiv.org/abs/2505.10911) trains on such videos: failures that need no failed episode.
     """
     turn = random.uniform(*_TURN_SHARES)
     back = random.uniform(0.0, turn - _MIN_REWOUND_SHARE)

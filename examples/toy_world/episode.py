@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What happened, moment by moment, and how far each task had come by then. T moments."""
+"""An episode's states over T moments, and how far each task has come at each moment."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from toy_world.scene import IN_TARGET_Y, REST_Y, TARGET_REACH, Float64Array, Sce
 from toy_world.tasks import Task
 
 NOTHING = -1  # in `held`
-CARRY_Y = 0.45  # a block is carried about so high
-RETREAT = 0.3  # so far the gripper withdraws when all is done
-_LOW_Y = IN_TARGET_Y - 0.02  # a block below lies on something
-_NEAR = 0.15  # so near to the target a block need not be lifted any more
-_GRASPED, _PLACED = 0.3, 0.9  # progress when the block is grasped, and when it is let go in its target
+CARRY_Y = 0.45  # height at which a block is carried
+RETREAT = 0.3  # how far the gripper withdraws at the end
+_LOW_Y = IN_TARGET_Y - 0.02  # a block below this height lies on something
+_NEAR = 0.15  # this close to the target, a block need not be lifted any more
+_GRASPED, _PLACED = 0.3, 0.9  # progress when the block is grasped, and when it is released in its target
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,8 @@ class Episode:
     """The world's state over time.
 
     gripper: float64 [T, 2]; is_closed: bool [T]
-    blocks: float64 [T, 3, 2], of COLOURS, NaN where there is none; held: int64 [T], the block in the gripper or NOTHING
+    blocks: float64 [T, 3, 2], in COLOURS order, NaN where there is none; held: int64 [T], the block in the gripper or
+        NOTHING
     """
 
     scene: Scene
@@ -37,7 +38,7 @@ class Episode:
         return len(self.gripper)
 
     def at(self, moments: npt.NDArray[np.int64]) -> Episode:
-        """The episode that shows these moments in this order."""
+        """Return an episode with these moments in this order."""
         return replace(
             self,
             gripper=self.gripper[moments],
@@ -53,10 +54,10 @@ class Episode:
         return (away < TARGET_REACH) & (block[:, 1] > _LOW_Y) & (self.held != task.block_index)
 
     def progress(self, task: Task) -> Float64Array:
-        """float64 [T], 0..1: how much of the way is done. Told from the state alone: it falls when things are undone.
+        """float64 [T], 0..1: how much is done. Depends on the state alone: it falls when things are undone.
 
-        Up to 0.3 the gripper comes near the block, up to 0.9 it carries the block to its target, up to 1 it withdraws.
-        A block that is not there, or another one in the gripper: 0.
+        Up to 0.3 the gripper approaches the block, up to 0.9 it carries the block to its target, up to 1 it withdraws.
+        A missing block, or another one in the gripper, gives 0.
         """
         if not self.scene.has_block(task.block_index):
             return np.zeros(len(self))
@@ -70,7 +71,7 @@ class Episode:
         return np.where(self.held == task.block_index, carried, done)
 
     def _carried(self, task: Task) -> Float64Array:
-        """float64 [T], 0..1: share of the block's way up, across and down."""
+        """float64 [T], 0..1: how much of the block's way up, across and down is done."""
         target = self.scene.targets[task.target_index]
         left = _way_left(self.blocks[:, task.block_index], target)
         whole = _way_left(np.array([[self.scene.blocks[task.block_index], REST_Y]]), target)
@@ -78,7 +79,7 @@ class Episode:
 
 
 def _way_left(block: Float64Array, target: float) -> Float64Array:
-    """[T, 2] -> [T]."""
+    """Map block positions, [T, 2], to distances that remain, [T]."""
     away = np.abs(block[:, 0] - target)
     far = np.minimum(away / _NEAR, 1)
     up = np.maximum(block[:, 1] - CARRY_Y, 0) * far

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Ways in which an episode goes: done well, done wrong, dropped, stopped half-way."""
+"""Episode motions: done well, done wrong, dropped, stopped half-way."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from toy_world.tasks import COLOURS, Task
 
 KINDS = ("success", "wrong_object", "wrong_target", "dropped", "stopped")
 FAILURES = KINDS[1:]
-_STEP = 0.03  # way of the gripper between two moments, at speed 1
-_FALL = 0.12  # way of a falling block between two moments
+_STEP = 0.03  # gripper distance per moment, at speed 1
+_FALL = 0.12  # distance per moment that a block falls
 _MAX_PAUSE = 4  # moments
 _STOPPED_PROGRESS = (0.08, 0.72)  # where an episode may stop
 _HOVER_Y = (0.35, CARRY_Y)
@@ -22,14 +22,14 @@ _HOVER_Y = (0.35, CARRY_Y)
 
 @dataclass
 class _Path:
-    """The gripper's way as it is being drawn: positions, and whether it is closed there."""
+    """The gripper's path so far: positions, and whether it is closed there."""
 
     random: np.random.Generator
     points: list[Float64Array]
     closed: list[bool]
 
     def move(self, x: float, y: float) -> None:
-        """At a speed and along a curve of its own; on either axis always towards the end."""
+        """Move at a random speed along a random curve, monotonically on both axes."""
         start, end = self.points[-1], np.array([x, y])
         count = max(2, round(np.abs(end - start).sum() / (_STEP * self.random.uniform(0.6, 1.6))))
         shares = np.linspace(0, 1, count + 1)[1:, None] ** self.random.uniform(0.6, 1.6, 2)
@@ -37,14 +37,14 @@ class _Path:
         self.closed += [self.closed[-1]] * count
 
     def grip(self, closed: bool) -> None:
-        """Opens or closes, and waits a little."""
+        """Open or close the gripper, and wait a little."""
         count = 1 + int(self.random.integers(_MAX_PAUSE))
         self.points += [self.points[-1]] * count
         self.closed += [closed] * count
 
 
 def random_episode(kind: str, task: Task, scene: Scene, random: np.random.Generator) -> Episode:
-    """An episode of one of KINDS at ``task``."""
+    """Make an episode for ``task``; ``kind`` is one of KINDS."""
     block, target = float(scene.blocks[task.block_index]), float(scene.targets[task.target_index])
     if kind == "wrong_object":
         others = [i for i in range(len(COLOURS)) if i != task.block_index and scene.has_block(i)]
@@ -69,9 +69,7 @@ def random_episode(kind: str, task: Task, scene: Scene, random: np.random.Genera
 
 
 def pick_and_place(scene: Scene, grasp_x: float, release_x: float, random: np.random.Generator) -> Episode:
-    """What happens when the gripper closes above one place of the table and opens above another. It grasps a block
-    only where it is.
-    """
+    """Close the gripper above one table position and open it above another. Only a block within reach is grasped."""
     path = _Path(random, [scene.gripper], [False])
     path.move(grasp_x, CARRY_Y)
     path.move(grasp_x, REST_Y)
@@ -90,7 +88,7 @@ def resting(scene: Scene) -> Episode:
 
 
 def _carry_and_drop(path: _Path, block: float, target: float, scene: Scene) -> None:
-    """Lets the block fall on the way, where the table is free, and goes on with nothing or goes up."""
+    """Drop the block on the way, where the table is free. Then move on without it, or move up."""
     random, y = path.random, float(path.points[-1][1])
     shares = random.permutation(np.linspace(0.1, 0.85, 16))
     standing = np.array([*scene.targets, *scene.blocks[~np.isnan(scene.blocks)]])
@@ -108,9 +106,9 @@ def _carry_and_drop(path: _Path, block: float, target: float, scene: Scene) -> N
 
 
 def _simulated(scene: Scene, gripper: Float64Array, is_closed: np.ndarray, reach: float = np.inf) -> Episode:
-    """What the blocks do while the gripper goes its way: they are held, or they fall.
+    """Simulate the blocks along the gripper's path: they are held, or they fall.
 
-    reach: how far the gripper may be from the block that it grasps
+    reach: largest distance at which the gripper can grasp a block
     """
     blocks = np.stack([scene.blocks, np.where(np.isnan(scene.blocks), np.nan, REST_Y)], axis=1)
     history = np.empty((len(gripper), *blocks.shape))
@@ -133,7 +131,7 @@ def _simulated(scene: Scene, gripper: Float64Array, is_closed: np.ndarray, reach
 
 
 def _stopped(episode: Episode, task: Task, random: np.random.Generator) -> Episode:
-    """The episode up to a moment half-way, which then stays."""
+    """Cut the episode at a moment half-way, and hold that state to the end."""
     low, high = _STOPPED_PROGRESS
     progress = episode.progress(task)
     halfway = np.flatnonzero((progress > low) & (progress < high))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pictures of the world."""
+"""Render pictures of the world."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _OPEN, _CLOSED = 0.115, 0.075  # from the gripper's middle to a finger's
 
 
 def render(episode: Episode) -> UInt8Array:
-    """uint8 [T, SIZE_PX, SIZE_PX, 3], RGB."""
+    """Return RGB frames, uint8 [T, SIZE_PX, SIZE_PX, 3]."""
     return np.stack([_picture(episode, moment) for moment in range(len(episode))])
 
 
@@ -59,7 +59,7 @@ def _draw_gripper(image: np.ndarray, x: float, y: float, opening: float) -> None
 
 
 def _fill(image: np.ndarray, x: float, y: float, width: float, height: float, colour: object) -> None:
-    """A rectangle given by its centre and size as shares of the picture."""
+    """Fill a rectangle, given its centre and size as shares of the picture."""
     left, right = (round(max(x + side * width / 2, 0) * SIZE_PX) for side in (-1, 1))
     top, bottom = (round(max(y + side * height / 2, 0) * SIZE_PX) for side in (-1, 1))
     image[top:bottom, left:right] = colour

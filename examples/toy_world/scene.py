@@ -18,17 +18,18 @@ Float64Array = npt.NDArray[np.float64]
 
 BLOCK_SIZE = 0.12
 TABLE_Y = 0.88
-REST_Y = TABLE_Y - BLOCK_SIZE / 2  # of a block on the table
-IN_TARGET_Y = REST_Y - 0.03  # of a block in the bowl or on the plate
-TARGET_REACH = 0.07  # a block so near to a target's middle is in it
+REST_Y = TABLE_Y - BLOCK_SIZE / 2  # height when a block lies on the table
+IN_TARGET_Y = REST_Y - 0.03  # height when a block lies in the bowl or on the plate
+TARGET_REACH = 0.07  # a block this close to a target's middle is in it
 _SLOT_SHARES = (0.12, 0.31, 0.5, 0.69, 0.88)
 _SLOT_JITTER = 0.025
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """blocks: x of each of COLOURS, NaN where there is none; targets: x of each of TARGETS; gripper: (x, y).
+    """Initial positions and shades.
 
+    blocks: x in COLOURS order, NaN where there is none; targets: x in TARGETS order; gripper: (x, y)
     shades: float64 [3], how light wall, table and the whole picture are
     """
 
@@ -38,12 +39,12 @@ class Scene:
     shades: Float64Array
 
     def has_block(self, index: int) -> bool:
-        """Whether the block of COLOURS[index] is there."""
+        """True if the COLOURS[index] block is present."""
         return not np.isnan(self.blocks[index])
 
 
 def random_scene(task: Task, random: np.random.Generator) -> Scene:
-    """Bowl, plate and two or three blocks, the task's among them, side by side in any order."""
+    """Place bowl, plate and two or three blocks, including the task's, side by side in random order."""
     slots = random.permutation(_SLOT_SHARES) + random.uniform(-_SLOT_JITTER, _SLOT_JITTER, len(_SLOT_SHARES))
     blocks = slots[len(TARGETS) :]
     if random.random() < 0.4:

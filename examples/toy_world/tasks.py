@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What may be asked for in the toy world, and the sentences that ask for it."""
+"""Tasks in the toy world, and the sentences that ask for them."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ _PREPOSITIONS = {"bowl": "in", "plate": "on"}
 
 @dataclass(frozen=True)
 class Task:
-    """The block of a colour is to lie in or on a target, and the gripper has let go of it."""
+    """Put the block with this colour in or on the target, and let go."""
 
     colour: str
     target: str
 
     @property
     def block_index(self) -> int:
-        """Which of COLOURS."""
+        """Index into COLOURS for the block."""
         return COLOURS.index(self.colour)
 
     @property
     def target_index(self) -> int:
-        """Which of TARGETS."""
+        """Index into TARGETS for the target."""
         return TARGETS.index(self.target)
 
     def sentence(self, verb: str = VERBS[0]) -> str:
-        """``put the red block in the bowl``."""
+        """Return a sentence such as ``put the red block in the bowl``."""
         return f"{verb} the {self.colour} block {_PREPOSITIONS[self.target]} the {self.target}"
 
 

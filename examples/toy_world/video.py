@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Frames as a video file that browsers play."""
+"""Write frames as a video file that browsers play."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import av
 
 from toy_world.render import UInt8Array
 
-FPS = 3  # as many frames a second as the client takes from a video unless told otherwise
+FPS = 3  # the client's default sampling rate for videos
 
 
 def write_video(file: Path, frames: UInt8Array, fps: int = FPS) -> None:
-    """Writes uint8 [T, H, W, 3], RGB, H and W even, as H.264."""
+    """Write uint8 [T, H, W, 3], RGB, H and W even, as H.264."""
     with av.open(str(file), "w") as container:
         stream = container.add_stream("libx264", rate=Fraction(fps), options={"crf": "1"})
         stream.height, stream.width = frames.shape[1:3]

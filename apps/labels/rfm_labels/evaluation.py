@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Compare label files of one dataset: which reward model suits the data. Needs pyarrow. E episodes, T frames.
+"""Compare label files to see which reward model suits a dataset. Needs pyarrow. E episodes, T frames.
 
-Value-order correlation (VOC) is the rank correlation of progress with time over a successful episode, as GVL (Ma et
-al., 2024) and Robometer's evaluation measure it. It shows that progress rises, not that its values are right: a clock's
+Value-order correlation (VOC) is the rank correlation between progress and time over a successful episode, as in GVL (Ma
+et al., 2024) and Robometer's evaluation. A high VOC shows that progress rises, not that its values are right: a clock's
 VOC is 1.
 """
 
@@ -27,17 +27,17 @@ Floats = npt.NDArray[np.floating[Any]]
 
 _OUTCOMES = {"1": True, "0": False, "true": True, "false": False, "1.0": True, "0.0": False}
 _UNKNOWN = ("", "nan")
-_EPISODE, _SUCCESS = "episode", "success"  # columns of a CSV file of outcomes
-_ROUNDING = 1e-12  # of a balanced accuracy
+_EPISODE, _SUCCESS = "episode", "success"  # columns in an outcomes CSV
+_ROUNDING = 1e-12  # tolerance when comparing balanced accuracies
 
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
-    """How well one number of an episode tells successes from failures.
+    """How well a single number per episode separates successes from failures.
 
-    auroc: probability that a success has the higher number, with half of the ties; 0.5 is chance
+    auroc: probability that a success has the higher number; ties count half; 0.5 is chance
     threshold: the lowest with the best balanced accuracy, for "success if at least this"
-    balanced_accuracy: mean of the shares of successes and of failures that the threshold gets right
+    balanced_accuracy: mean of sensitivity and specificity at the threshold
     """
 
     auroc: float
@@ -47,19 +47,19 @@ class Ranking:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """One label file's measures. A mean is over episodes.
+    """Metrics for one label file. Means are over episodes.
 
-    name: the file's name without its ending
-    spearman, kendall: mean VOC, as Spearman's rho and Kendall's tau-b, over the known successes, or over all episodes
-        if outcomes are unknown; None: progress is constant in each
+    name: file name without its ending
+    spearman, kendall: mean VOC as Spearman's rho and Kendall's tau-b, over known successes, or over all episodes if
+        outcomes are unknown; None: progress is constant in every episode
     num_constant: episodes with constant progress, which have no VOC
-    by_success, by_progress: how ``voted_success`` and progress at the last frame tell successes from failures; None:
-        outcomes are unknown or all alike, or success is not predicted
+    by_success, by_progress: how well ``voted_success`` and final progress separate successes from failures; None:
+        outcomes are unknown or all alike, or the model does not predict success
     final_of_successes, final_of_failures: mean progress at the last frame; None: no such episode
-    final: mean progress at the last frame of all episodes
+    final: mean progress at the last frame, over all episodes
     backwards: mean share of steps on which progress falls by more than 0.01
-    frames_per_s: frames that the labelling run scored in a second; None: the file does not say
-    final_progress: float64 [E], progress at the last frame of each episode
+    frames_per_s: labelling speed; None: not in the file
+    final_progress: float64 [E], progress at the last frame
     """
 
     name: str
@@ -80,9 +80,9 @@ class Evaluation:
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """How far two label files agree on progress. A mean is over episodes.
+    """How closely two label files agree on progress. Means are over episodes.
 
-    spearman: mean rank correlation of both files' progress; None: a file's progress is constant in each episode
+    spearman: mean rank correlation between the two progress curves; None: one is constant in every episode
     distance: mean absolute difference
     """
 
@@ -94,12 +94,12 @@ class Agreement:
 
 @dataclass(frozen=True, eq=False)
 class LabelComparison:
-    """The evaluations of several label files on the episodes that all of them have.
+    """Evaluations of several label files, on the episodes that all of them share.
 
-    episodes: numbers of these episodes
+    episodes: numbers of the shared episodes
     is_success: bool [E]; None: outcomes are unknown
     num_left_out: episodes that only some files have
-    num_without_outcome: episodes of all files that are left out, since theirs is None
+    num_without_outcome: shared episodes left out because their outcome is None
     """
 
     evaluations: Sequence[Evaluation]
@@ -112,7 +112,7 @@ class LabelComparison:
 
 @dataclass(frozen=True, eq=False)
 class _Scores:
-    """An episode's labelled frames. success: None: not predicted"""
+    """An episode's labelled frames. success: None: not predicted."""
 
     frames: npt.NDArray[np.int64]
     progress: Floats
@@ -120,11 +120,11 @@ class _Scores:
 
 
 def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool | None] | None = None) -> LabelComparison:
-    """Return the evaluations of label files of one dataset.
+    """Return an evaluation of label files for one dataset.
 
-    outcomes: True for each successful episode, by its number, and None for each to leave out; None: unknown
+    outcomes: by episode number: True for success, None to leave the episode out; None: unknown
 
-    Raises DatasetError for an unreadable file, files without a common episode, or an episode without an outcome.
+    Raises DatasetError if a file is unreadable, the files share no episode, or an episode lacks an outcome.
     """
     require("labels", len(files) > 0, "at least one file", "none")
     names = _names(files)
@@ -149,10 +149,10 @@ def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool | None] |
 
 
 def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool | None]:
-    """Return each episode's outcome by its number; None: null, NaN or an empty cell. Raises DatasetError.
+    """Return each episode's outcome by number; None for null, NaN or an empty cell. Raises DatasetError.
 
-    source: a CSV file with the columns ``episode`` and ``success``, or the name of a column of a LeRobot dataset: of
-        its frames, whose last value counts, or of its episodes. Values: true, false, 1 or 0
+    source: a CSV file with the columns ``episode`` and ``success``, or a LeRobot column: per frame, where the last
+        value counts, or per episode. Values: true, false, 1 or 0
     dataset: the LeRobot dataset's folder
     """
     if Path(source).suffix.lower() == ".csv":
@@ -206,7 +206,7 @@ def _outcome(where: str, value: Any) -> bool | None:
 
 
 def _names(files: Sequence[Path]) -> list[str]:
-    """Return a name for each file: that of the reward, with its folder if two are alike."""
+    """Return a name for each file: the reward's name, or the path if two rewards share a name."""
     short = [reward_name(file) for file in files]
     names = [name if short.count(name) == 1 else str(file) for name, file in zip(short, files, strict=True)]
     require("labels", len(set(names)) == len(names), "each file once", ", ".join(names))
@@ -225,7 +225,7 @@ def _episodes(file: Path) -> dict[int, _Scores]:
     order = np.lexsort((frames, episodes))
     numbers, starts = np.unique(episodes[order], return_index=True)
     for episode, own in zip(numbers.tolist(), np.split(order, starts[1:]), strict=True):
-        rows = own[np.isfinite(progress[own])]  # NaN: a frame without a label
+        rows = own[np.isfinite(progress[own])]  # NaN: unlabelled frame
         require(f"{file}: episode {episode}", len(rows) > 0, "progress", "none")
         predicted = None if success is None or np.isnan(success[rows]).any() else success[rows]
         scores[episode] = _Scores(frames[rows], progress[rows], predicted)
@@ -274,7 +274,7 @@ def _agreement(
 
 
 def _order(progress: Floats) -> tuple[float, float] | None:
-    """Return Spearman's rho and Kendall's tau-b of progress with time; None: progress is constant."""
+    """Return Spearman's rho and Kendall's tau-b between progress and time; None: progress is constant."""
     from scipy.stats import kendalltau
 
     time = np.arange(len(progress))
@@ -283,7 +283,7 @@ def _order(progress: Floats) -> tuple[float, float] | None:
 
 
 def _spearman(first: npt.NDArray[Any], second: npt.NDArray[Any]) -> float | None:
-    """Return Spearman's rank correlation of two arrays [T]; equal values share a rank. None: an array is constant."""
+    """Return Spearman's rank correlation between two arrays [T]; ties share a rank. None: an array is constant."""
     from scipy.stats import spearmanr
 
     is_constant = np.ptp(first) == 0 or np.ptp(second) == 0

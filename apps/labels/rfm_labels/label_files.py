@@ -37,13 +37,13 @@ from rfm_labels.writing import (
     SIGNALS_PROVENANCE_KEY,
 )
 
-_OWN_NAME = "rfm"  # default of ``LabelOptions.name``
+_OWN_NAME = "rfm"  # default for ``LabelOptions.name``
 _PROGRESS_NAMES = ("progress", "progress_sparse", "progress_dense")
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Scores of T frames, float32 [T] each, NaN for a frame without a label. success: None: not predicted"""
+    """Scores for T frames, float32 [T] each, NaN at frames without a label. success: None: not predicted."""
 
     progress: Float32Array
     success: Float32Array | None
@@ -51,11 +51,11 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeLabels:
-    """The labels of one episode, with T labelled frames.
+    """One episode's labels, at T labelled frames.
 
-    frames: int64 [T], numbers of the labelled frames in the episode
+    frames: int64 [T], frame numbers within the episode
     fused: scores fused over all cameras
-    cameras: each camera's scores; empty for a single camera
+    cameras: scores by camera; empty for a single camera
     is_answered: bool [T], False at the frames that the model skipped
     """
 
@@ -66,11 +66,11 @@ class EpisodeLabels:
 
 
 def find_label_files(root: Path) -> list[Path]:
-    """Return the label files of a dataset, those with the default name first.
+    """Find a dataset's label files, with the default name first.
 
     root: the dataset's folder, or HDF5 file
 
-    For labels in both formats, return only the progress file. Raises DatasetError for a folder with labels of several
+    For labels in both formats, return only the progress file. Raises DatasetError for a folder with labels for several
     HDF5 files.
     """
     folder = root.parent if root.is_file() else root
@@ -88,7 +88,7 @@ def find_label_files(root: Path) -> list[Path]:
 
 
 def reward_name(file: Path) -> str:
-    """Return the name of the reward in a label file, after the dataset's ``label_prefix``."""
+    """Return the reward's name, including the dataset's ``label_prefix``, from the file name."""
     return file.name.removesuffix(PROGRESS_ENDING).removesuffix(".parquet")
 
 
@@ -98,11 +98,11 @@ def _prefix(file: Path) -> str:
 
 
 def read_label_table(file: Path, *, episode: int | None = None) -> Any:
-    """Return a label file of any format as a pyarrow Table, with the parts' column names. Raises DatasetError.
+    """Read a label file in any format as a pyarrow Table, with the parts' column names. Raises DatasetError.
 
-    Score columns: those of ``SCORES``, as far as the file has them.
+    Score columns: those in ``SCORES`` that the file has.
 
-    episode: only this episode's rows; None: all
+    episode: read only this episode's rows; None: all
     """
     from pyarrow import ArrowException, parquet
 
@@ -117,17 +117,17 @@ def read_label_table(file: Path, *, episode: int | None = None) -> Any:
 
 
 def read_cost(file: Path) -> Cost | None:
-    """Return the cost of a file's labels; None: the file does not say. Raises DatasetError."""
+    """Return what the labels cost; None: not in the file. Raises DatasetError."""
     return Cost.parse(_metadata(file).get(COST_KEY))
 
 
 def read_blank(file: Path) -> BlankCameras:
-    """Return the cameras that show nothing, as the metadata of a file's labels tell them. Raises DatasetError."""
+    """Read the blank cameras from a label file's metadata. Raises DatasetError."""
     return blank_from_metadata(_metadata(file))
 
 
 def read_provenance(file: Path) -> dict[str, Any]:
-    """Return writer, dataset and recipe of a label file, as far as it tells them. Raises DatasetError."""
+    """Read a label file's writer, dataset and recipe, as far as recorded. Raises DatasetError."""
     return _provenance(_metadata(file))
 
 
@@ -151,7 +151,7 @@ def _no_labels(file: Path, error: Exception) -> DatasetError:
 
 
 def read_episode_labels(file: Path, episode: int) -> EpisodeLabels | None:
-    """Return the labels of an episode; None: the file does not have the episode. Raises DatasetError."""
+    """Return an episode's labels; None: the file does not have the episode. Raises DatasetError."""
     table = read_label_table(file, episode=episode)
     require(file, "frame_index" in table.column_names, "the column frame_index", ", ".join(table.column_names))
     if not len(table):
@@ -170,7 +170,7 @@ def read_episode_labels(file: Path, episode: int) -> EpisodeLabels | None:
 
 
 def _score_columns(file: Path, names: Sequence[str]) -> dict[str, str]:
-    """Score columns by their names in the parts. Raises DatasetError without progress or ``episode_index``."""
+    """Map the parts' score column names to the file's. Raises DatasetError without progress or ``episode_index``."""
     require(file, "episode_index" in names, "the column episode_index", ", ".join(names))
     own = next((name for name in _PROGRESS_NAMES if name in names), None)
     signal = next((name for name in names if name.startswith("reward.") and name.endswith(".progress")), None)
@@ -179,7 +179,7 @@ def _score_columns(file: Path, names: Sequence[str]) -> dict[str, str]:
         raise DatasetError.at(file, "a column of progress", ", ".join(names))
     before = progress.removesuffix("progress")
     begins = {score: score if own is not None else before + signal for score, signal in SIGNAL_NAMES.items()}
-    columns = {}  # in the order of ``SCORES``
+    columns = {}  # in ``SCORES`` order
     for score, begin in begins.items():
         if (fused := progress if score == PROGRESS else begin) in names:
             columns[score] = fused
@@ -191,9 +191,9 @@ def _score_columns(file: Path, names: Sequence[str]) -> dict[str, str]:
 class LabelFile:
     """An existing label file, which a run may replace.
 
-    provenance: writer, dataset and recipe; empty: labels of another program
-    digests: digest of each labelled episode, by its number
-    cost: of the last run that scored; None: unknown
+    provenance: writer, dataset and recipe; empty: another program wrote the labels
+    digests: digest by episode number
+    cost: from the last run that scored; None: unknown
     option: command-line option that chooses another path
     """
 
@@ -205,7 +205,7 @@ class LabelFile:
 
     @classmethod
     def read(cls, path: Path, option: str = "--name") -> LabelFile:
-        """Return what a file tells in its metadata."""
+        """Read what a file's metadata say."""
         metadata: Mapping[bytes, bytes] = {}
         with suppress(DatasetError):
             metadata = _metadata(path)
@@ -216,7 +216,7 @@ class LabelFile:
         return cls(path, told if is_own else {}, digests, Cost.parse(metadata.get(COST_KEY)), option)
 
     def check(self, plan: Plan) -> None:
-        """Raise DatasetError unless the plan gives all labels of the file again, by the same recipe."""
+        """Raise DatasetError unless the plan reproduces all labels in the file by the same recipe."""
         there, now = _settings(_recipe(self.provenance)), _settings(_recipe(plan.provenance()))
         names = [name for name in dict.fromkeys([*now, *there]) if there.get(name) != now.get(name)]
         differ = "; ".join(f"{name}: {there.get(name, 'none')} there, {now.get(name, 'none')} now" for name in names)
@@ -233,13 +233,13 @@ class LabelFile:
 
 
 def _recipe(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """The provenance without the dataset's source: the episodes' digests identify the dataset."""
+    """The provenance without the dataset's source: episode digests identify the dataset."""
     dataset = provenance.get("dataset", {})
     return {**provenance, "writer": None, "dataset": {"kind": dataset.get("kind")}}
 
 
 def _settings(document: Mapping[str, Any]) -> dict[str, str]:
-    """Settings by their paths in messages, for example ``sampling.frames``."""
+    """Settings by path, for messages, for example ``sampling.frames``."""
     settings: dict[str, str] = {}
     for name, value in document.items():
         if isinstance(value, Mapping):

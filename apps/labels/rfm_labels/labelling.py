@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Label a dataset: plan, score, write the label files.
 
-Finished episodes stay in the parts. A run replaces label files on request, or if it gives all their labels again.
+Finished episodes stay in the parts. A run replaces label files only if it reproduces all their labels, or on request.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from rfm_labels.writing import (
 class Report:
     """The result of a labelling run.
 
-    files: label files that were written; empty if an episode failed, or for a shard
+    files: label files written; empty if an episode failed, or for a shard
     failures: episodes without labels
-    parts: folder or URL of the finished episodes
+    parts: folder or URL that holds the finished episodes
     summary: None: no file was written
     plan: the episodes to label, and the recipe
     """
@@ -55,13 +55,13 @@ class Report:
 
 
 def label(dataset: Dataset, scorer: Scorer, options: LabelOptions = DEFAULTS, watch: Watch = QUIET) -> Report:
-    """Label every frame of the chosen episodes, and write the label files.
+    """Label every frame in the chosen episodes, and write the label files.
 
     If an episode fails, the report names it, and no label file is written. The same call then labels only the missing
     episodes.
 
-    Raises DatasetError, before the first score, for a contradictory dataset or a label file that this run may not
-    replace; RewardError if the scorer is gone; OSError for a full disk.
+    Raises DatasetError, before scoring starts, if the dataset is contradictory or this run may not replace a label
+    file; RewardError if the scorer is gone; OSError if the disk is full.
     """
     outputs = Outputs.of(dataset, options)
     plan = planned(dataset, scorer, outputs, watch, writes=True)
@@ -71,9 +71,9 @@ def label(dataset: Dataset, scorer: Scorer, options: LabelOptions = DEFAULTS, wa
 
 
 def planned(dataset: Dataset, scorer: Scorer, outputs: Outputs, watch: Watch = QUIET, *, writes: bool = False) -> Plan:
-    """Return the plan, once all that the run needs before the first score is checked.
+    """Check everything that the run needs before scoring starts, and return the plan.
 
-    writes: True: make the folder for the label files
+    writes: True: create the folder for the label files
 
     Raises DatasetError, also for existing label files that this run may not replace.
     """
@@ -103,7 +103,7 @@ def put_together(
 ) -> Report:
     """Write the label files, unless an episode failed or the run labelled only a shard.
 
-    cost: of this run; None: it scored nothing, or does not know, and the cost in existing files holds
+    cost: this run's cost; None: nothing scored, or unknown: keep the cost in existing files
     """
     report = Report([], failures, outputs.parts.url, None, plan)
     if failures or outputs.options.shard is not None:
@@ -128,9 +128,9 @@ def put_together(
 
 @dataclass(frozen=True)
 class Outputs:
-    """Paths of the parts, and of the label files in the formats to write.
+    """Paths for the parts and the label files.
 
-    prefix: of the names of the label files, as ``Dataset.label_prefix``
+    prefix: starts each label file's name, as in ``Dataset.label_prefix``
     """
 
     folder: Path
@@ -151,17 +151,17 @@ class Outputs:
 
     @property
     def signals(self) -> list[Path]:
-        """The file of frame signals."""
+        """The frame signal file."""
         named = self.folder / SIGNALS_FOLDER / f"{self.prefix}{self.options.name}.parquet"
         return [named] if "signals" in self.options.formats else []
 
     @cached_property
     def parts(self) -> Parts:
-        """The finished episodes. The first access makes their folder."""
+        """The finished episodes. First access creates their folder."""
         return Parts(self.options.parts or str(self.folder / f".{self.options.name}_parts"))
 
     def make_folder(self) -> None:
-        """Make the folder if it is missing. Raises DatasetError if labels cannot be written there."""
+        """Create the folder if it is missing. Raises DatasetError if it is not writable."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             if not os.access(self.folder, os.W_OK):
@@ -171,21 +171,21 @@ class Outputs:
             raise DatasetError.at(self.folder, "a folder for the labels", got) from error
 
     def before(self) -> list[LabelFile]:
-        """Return the label files that exist already."""
+        """Return the existing label files."""
         named = zip(self.progress, ("--name", "--alias"), strict=False)
         found = [LabelFile.read(path, option) for path, option in named if path.exists()]
         return found + [LabelFile.read(path) for path in self.signals if path.exists()]
 
     def earlier_cost(self, plan: Plan) -> Cost | None:
-        """Return the cost of these labels in existing files; None: unknown."""
-        digests = {item.digest for item in plan.items}  # labels of another recipe have other digests
+        """Return the cost that existing files record for these labels; None: unknown."""
+        digests = {item.digest for item in plan.items}  # another recipe gives other digests
         known = (file.cost for file in self.before() if digests & set(file.digests.values()))
         return next(filter(None, known), None)
 
     def write(self, plan: Plan, labels: Any, cost: Cost | None) -> list[Path]:
         """Write the labels to all files, and return their paths. Raises OSError.
 
-        labels: table of ``Parts.read_all``
+        labels: table from ``Parts.read_all``
         cost: for the metadata; None: unknown
         """
         columns = [name for name in labels.column_names if name not in IDENTITY]

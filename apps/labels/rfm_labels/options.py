@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a caller gives to a labelling run: options, checked once for programs and command lines, and callbacks."""
+"""Inputs for a labelling run: callbacks, and options validated once for both programs and command lines."""
 
 from __future__ import annotations
 
@@ -23,38 +23,38 @@ Fill: TypeAlias = Literal["linear", "none"]
 Format: TypeAlias = Literal["progress", "signals"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 DEFAULT_WORKERS = 4
-LAST = "last"  # in place of a picture of the goal
+LAST = "last"  # given instead of a goal picture
 _NAME = re.compile(r"[A-Za-z0-9][\w-]{0,63}")
 _RANGE = re.compile(r"(\d+)(?::(\d+))?")
 
 
 class Watch:
-    """Callbacks of a run. They do nothing here; override those that you need."""
+    """Callbacks for a run. All do nothing by default; override what you need."""
 
     def note(self, text: str) -> None:
-        """Callback with a line for the user: a decision, or a warning."""
+        """Receive a line for the user: a decision, or a warning."""
 
     def checking(self, num_episodes: int) -> None:
-        """Callback before the check of all episodes."""
+        """Called before all episodes are checked."""
 
     def checked(self, episode: DatasetEpisode) -> None:
-        """Callback when all frames of an episode are found."""
+        """Called when all frames in an episode are found."""
 
     def begin(self, num_frames: int, num_finished: int) -> None:
-        """Callback before the first score, with the frames of the run, and those already finished."""
+        """Called before the first score, with the run's frame count and how many are already finished."""
 
     def scored(self, episode: DatasetEpisode) -> None:
-        """Callback when the episode is finished."""
+        """Called when the episode is finished."""
 
     def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
-        """Callback when the episode has failed."""
+        """Called when the episode has failed."""
 
 
 QUIET = Watch()
 
 
 def parse_episodes(text: str) -> list[int]:
-    """Return the sorted numbers in ``0:100,205``: 0 to 99, and 205. Raises ValueError."""
+    """Parse episode numbers: ``0:100,205`` gives 0 to 99 and 205, sorted. Raises ValueError."""
     numbers: list[int] = []
     for part in text.split(","):
         match = _RANGE.fullmatch(part.strip())
@@ -65,7 +65,7 @@ def parse_episodes(text: str) -> list[int]:
 
 
 def parse_shard(text: str) -> tuple[int, int]:
-    """Return i and n of ``i/n``. Raises ValueError."""
+    """Parse ``i/n`` into i and n. Raises ValueError."""
     match = re.fullmatch(r"(\d+)/(\d+)", text)
     if match is None:
         raise InvalidValueError.at("shard", "i/n, for example 0/8", repr(text))
@@ -78,13 +78,14 @@ def _names(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class LabelOptions(Settings):
-    """Options of a labelling run. Raises ConfigError, a ValueError.
+    """Options for a labelling run. Raises ConfigError, a ValueError.
 
     cameras: empty: all but depth cameras
-    sampling, frames: None: those of the checkpoint's training (``Sampling.of``)
+    sampling, frames: None: as in the checkpoint's training (``Sampling.of``)
     episodes: numbers; None: all
-    filter_key: only these of the episodes; None: all
-    shard: (i, n): label share i, from 0, of n equal shares, without label files; a later run without shard writes them
+    filter_key: label only its episodes; None: all
+    shard: (i, n): label share i out of n equal shares, counted from 0, without label files; a later run without shard
+        writes them
     parts: None: ``.<name>_parts`` in the output folder
     """
 
@@ -180,7 +181,7 @@ DEFAULTS = LabelOptions()
 
 @dataclass(frozen=True)
 class RayOptions(Settings):
-    """Ray cluster, number of actors and their GPUs. Raises ConfigError, a ValueError."""
+    """Ray cluster, actor count and GPUs per actor. Raises ConfigError, a ValueError."""
 
     TITLE: ClassVar[str] = "With --engine ray"
 
@@ -192,7 +193,7 @@ class RayOptions(Settings):
 
 
 def chosen_numbers(dataset: Dataset, options: LabelOptions) -> list[int]:
-    """Return the numbers of the episodes that the options choose. Raises DatasetError for an unknown episode."""
+    """Return the episode numbers that the options choose. Raises DatasetError for an unknown episode."""
     known = set(dataset.numbers)
     wanted = sorted(known) if options.episodes is None else sorted(set(options.episodes))
     missing = [number for number in wanted if number not in known]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Draw a summary of labels, and an evaluation. Needs matplotlib."""
+"""Draw label summaries and evaluations. Needs matplotlib."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH_IN = 7.0  # of a page
-SUMMARY_IN, EVALUATION_IN = 1.9, 1.3  # heights of axes
+WIDTH_IN = 7.0  # page width
+SUMMARY_IN, EVALUATION_IN = 1.9, 1.3  # axes heights
 HEADLINE_IN = 0.5
 BINS = 20
-STYLE = "rfm_client.figure"  # the style file of all figures says what each colour means
-SUCCESS_COLOUR, UNDONE_COLOUR, FAILURE_COLOUR = "C2", "C1", "C6"  # the first, of progress, is matplotlib's choice
+STYLE = "rfm_client.figure"  # the shared style file defines what each colour means
+SUCCESS_COLOUR, UNDONE_COLOUR, FAILURE_COLOUR = "C2", "C1", "C6"  # matplotlib's default colour shows progress
 
 
 def draw_summary(file: Path, summary: Summary, labels: Path) -> None:
-    """Draw histograms of final progress and of steps backwards, and best success over final progress.
+    """Draw histograms (final progress, share of backward steps) and a scatter plot (best success over final progress).
 
-    labels: the file of the labels, whose metadata give the title
+    labels: label file; its metadata give the title
     """
     try:
         import matplotlib.style
@@ -68,9 +68,9 @@ def draw_summary(file: Path, summary: Summary, labels: Path) -> None:
 
 
 def draw_evaluation(file: Path, comparison: LabelComparison, labels: Sequence[Path]) -> None:
-    """Draw a histogram of final progress for each label file, successes and failures apart.
+    """Draw one histogram of final progress per label file, with successes and failures in different colours.
 
-    labels: the file of each evaluation, whose metadata give the titles
+    labels: label file for each evaluation; their metadata give the titles
     """
     import matplotlib.style
     from matplotlib.figure import Figure
@@ -107,7 +107,7 @@ def _draw_ends(
     outcomes: Mapping[str, npt.NDArray[np.bool_]],
     colours: Mapping[str, str],
 ) -> None:
-    """Draw a histogram of final progress; if outcomes are known, the last of them, a failure, stands below."""
+    """Draw a histogram of final progress. Stack known outcomes with the last one, failure, at the bottom."""
     if not outcomes:
         ax.hist(final, bins=BINS, range=(0, 1))
     else:
@@ -122,7 +122,7 @@ def _head(figure: Figure, *lines: str) -> None:
 
 
 def _origin(labels: Path) -> tuple[str, str]:
-    """Return the sources of the dataset and of the checkpoint; of an unknown checkpoint an empty text."""
+    """Return the dataset's and the checkpoint's source; the latter is empty if unknown."""
     told = read_provenance(labels)
     dataset, checkpoint = ((told.get(name) or {}).get("source") for name in ("dataset", "checkpoint"))
     return dataset or labels.parent.name, checkpoint or ""

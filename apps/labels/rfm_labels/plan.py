@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The plan of a labelling run, made before the first frame is scored: its recipe, its episodes, all their faults."""
+"""Plan a labelling run before the first frame is scored: recipe and episodes. Reports all faults at once."""
 
 from __future__ import annotations
 
@@ -20,22 +20,26 @@ from rfm_labels.datasets.stored_files import digest_of
 from rfm_labels.options import LAST, QUIET, LabelOptions, Mode, ProgressRule, Watch, chosen_numbers
 from rfm_labels.scorer import CheckpointFacts, Scorer
 
-_RECIPE_FORMAT = 4  # increased when the same recipe gives other scores or other digests
-_OPTIONAL = ("progress_rule",)  # labels made before have no such field
+_RECIPE_FORMAT = 4  # increase when the same recipe gives other scores or other digests
+_OPTIONAL = ("progress_rule",)  # omit when empty: older labels have no such field
 _OF_TRAINING = {True: "as upstream's training pads shorter clips", False: "the checkpoint's training did not pad"}
 _OF_CHECKPOINT = "the most in training; if the checkpoint does not say, the most its network takes"
 
 
 @dataclass(frozen=True)
 class Goal:
-    """A picture of the task done. name: of its file, or ``last``; content: of the file; empty: the last frame"""
+    """A picture that shows the finished task.
+
+    name: file name, or ``last``
+    content: file content; empty: use the last frame
+    """
 
     name: str
     content: bytes = field(default=b"", repr=False)
 
     @classmethod
     def of(cls, given: str) -> Goal:
-        """Return the goal of an option. Raises InvalidSampleError for a file that is no picture."""
+        """Parse the goal option. Raises InvalidSampleError if the file is not a picture."""
         if given == LAST:
             return cls(given)
         try:
@@ -48,11 +52,11 @@ class Goal:
         return goal
 
     def picture(self, frames: UInt8Array) -> UInt8Array:
-        """Return the picture, uint8 [H, W, 3], for these frames, uint8 [T, H, W, 3]."""
+        """Return the goal picture, uint8 [H, W, 3], for these frames, uint8 [T, H, W, 3]."""
         return Picture(self.content).pixels() if self.content else frames[-1]
 
     def document(self) -> dict[str, str]:
-        """Return the goal as it stands in the provenance."""
+        """Return the goal for the provenance."""
         return {"picture": self.name, **({"digest": digest_of([self.content])} if self.content else {})}
 
 
@@ -60,12 +64,12 @@ class Goal:
 class Recipe:
     """All settings that decide a label, besides the frames.
 
-    cameras: are scored by themselves
-    views: further cameras that are shown beside the only one of ``cameras``
-    decoders: library that decodes each camera's frames, with version, since versions differ in colours; None: pixels
-    corrections: of the cameras whose frames are turned, or stored as BGR
-    verify: True: videos are identified by their content
-    progress_rule: makes progress of remaining seconds; None: the checkpoint predicts progress
+    cameras: scored separately
+    views: further cameras, shown beside the single entry in ``cameras``
+    decoders: library and version that decode each camera, since colours differ between versions; None: stored as pixels
+    corrections: for cameras whose frames are turned, or stored as BGR
+    verify: True: identify videos by content
+    progress_rule: derives progress from remaining seconds; None: the checkpoint predicts progress
     """
 
     checkpoint: CheckpointFacts
@@ -83,10 +87,10 @@ class Recipe:
 
     @classmethod
     def of(cls, options: LabelOptions, dataset: Dataset, checkpoint: CheckpointFacts) -> Recipe:
-        """Return the recipe of the options; the dataset and the checkpoint decide the rest.
+        """Derive the recipe from the options, the dataset and the checkpoint.
 
-        Raises DatasetError for an unknown camera, InvalidSampleError if the rule lacks its number of frames, or for
-        another mode than ``whole`` with a checkpoint that needs the whole episode.
+        Raises DatasetError for an unknown camera, InvalidSampleError if the sampling rule needs a frame count, or if
+        the checkpoint needs the whole episode and the mode is not ``whole``.
         """
         numbers = chosen_numbers(dataset, replace(options, shard=None))
         cameras, views = chosen_cameras(dataset, options, numbers)
@@ -122,34 +126,34 @@ class Recipe:
 
     @property
     def decoded_cameras(self) -> tuple[str, ...]:
-        """The cameras and the views, each once."""
+        """The cameras and the views, without repetition."""
         return tuple(dict.fromkeys((*self.cameras, *self.views)))
 
     @property
     def orientations(self) -> Mapping[str, Orientation]:
-        """Orientation of each camera that is turned."""
+        """Orientation by camera, for turned cameras."""
         return {camera: each.orient for camera, each in self.corrections.items() if each.orient != "none"}
 
     @property
     def channels(self) -> Mapping[str, ChannelOrder]:
-        """Order of the stored colours of each camera that does not store RGB."""
+        """Stored channel order by camera, for cameras that do not store RGB."""
         return {camera: each.channels for camera, each in self.corrections.items() if each.channels != "rgb"}
 
     def in_one_pass(self, num_frames: int) -> bool:
-        """True if one pass over ``num_frames`` frames gives every frame's score."""
+        """True if one pass over ``num_frames`` frames scores every frame."""
         rule, frames = self.sampling.rule, self.sampling.frames
         shows_all = rule == "all" or (rule == "rint" and frames is not None and num_frames <= frames)
         return self.mode == "whole" or (shows_all and self.checkpoint.is_causal)
 
     def document(self) -> dict[str, Any]:
-        """Return the recipe as it stands in the provenance."""
+        """Return the recipe for the provenance."""
         return {
             "format": _RECIPE_FORMAT,
             "checkpoint": self.checkpoint.document(),
             "cameras": list(self.cameras),
             "decoders": dict(self.decoders),
             "orientations": dict(self.orientations),
-            **({"channels": dict(self.channels)} if self.channels else {}),  # as labels made before have no such field
+            **({"channels": dict(self.channels)} if self.channels else {}),  # older labels have no such field
             "sampling": asdict(self.sampling),
             "mode": self.mode,
             "fuse": self.fuse if len(self.cameras) > 1 else None,
@@ -161,7 +165,7 @@ class Recipe:
         }
 
     def told(self, options: LabelOptions) -> list[str]:
-        """Return a line for each decision, with its reason."""
+        """Explain each decision and the reason for it, one per line."""
         lines = [f"cameras: {', '.join(self.cameras)} ({'asked for' if options.cameras else 'all but depth cameras'})"]
         lines += [f"views: {', '.join(self.views)} (shown beside it)"] if self.views else []
         lines += [] if self.goal is None else [f"goal: {self.goal.name}"]
@@ -175,7 +179,7 @@ class Recipe:
         return lines + [f"fuse: {self.fuse} of {len(self.cameras)} cameras"] * (len(self.cameras) > 1)
 
     def check_lengths(self, episodes: Sequence[DatasetEpisode]) -> None:
-        """Raise DatasetError for an episode above the checkpoint's limit, if the recipe shows whole episodes."""
+        """Raise DatasetError if the recipe shows whole episodes and one exceeds the checkpoint's frame limit."""
         limit = self.checkpoint.max_frames
         shows_all = self.mode == "whole" or self.sampling.frames is None
         if not (episodes and shows_all and limit is not None):
@@ -193,22 +197,22 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Item:
-    """One episode to label. digest: of everything that decides its labels"""
+    """One episode to label. digest: over everything that decides its labels."""
 
     episode: DatasetEpisode
     digest: str
 
     @property
     def key(self) -> str:
-        """Name of the item's part."""
+        """The part's name, without suffix."""
         return f"episode-{self.episode.index:06d}-{self.digest}"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The episodes to label, in the order of their frames, and the recipe.
+    """The recipe, and the episodes to label, in frame order.
 
-    dataset: its kind, source and revision, for the provenance
+    dataset: kind, source and revision, for the provenance
     """
 
     items: Sequence[Item]
@@ -217,15 +221,15 @@ class Plan:
 
     @property
     def num_frames(self) -> int:
-        """Number of frames of all episodes."""
+        """Frames in all episodes."""
         return sum(item.episode.num_frames for item in self.items)
 
     def digests(self) -> dict[str, str]:
-        """Return each item's digest by episode number."""
+        """Return item digests by episode number."""
         return {str(item.episode.index): item.digest for item in self.items}
 
     def provenance(self) -> dict[str, Any]:
-        """Return writer, dataset and recipe of the labels, without user and time: equal runs give equal provenance."""
+        """Return the labels' writer, dataset and recipe, without user and time: equal runs give equal provenance."""
         digest = digest_of(item.digest.encode() for item in self.items)
         version = importlib.metadata.version("rfm-client")
         dataset = {**self.dataset, "digest": digest}
@@ -242,7 +246,7 @@ def chosen_cameras(
 
 
 def make_plan(dataset: Dataset, recipe: Recipe, episodes: Iterable[DatasetEpisode]) -> Plan:
-    """Return the plan of these episodes, without a look at a video's frames. Raises DatasetError for a missing file."""
+    """Plan these episodes without reading video frames. Raises DatasetError if a file is missing."""
     document = json.dumps(recipe.document(), sort_keys=True)
     items = []
     for episode in episodes:
@@ -254,7 +258,7 @@ def make_plan(dataset: Dataset, recipe: Recipe, episodes: Iterable[DatasetEpisod
 
 
 def _check_progress(rule: ProgressRule | None, checkpoint: CheckpointFacts) -> None:
-    """Raise InvalidSampleError unless either the checkpoint or a rule gives progress."""
+    """Raise InvalidSampleError unless exactly one of checkpoint and rule provides progress."""
     if checkpoint.has_progress and rule is not None:
         raise InvalidSampleError.at("progress_rule", "none with this model, which predicts progress", rule)
     if not checkpoint.has_progress and rule is None:
@@ -264,7 +268,7 @@ def _check_progress(rule: ProgressRule | None, checkpoint: CheckpointFacts) -> N
 
 
 def _check_views(options: LabelOptions, cameras: Sequence[str], checkpoint: CheckpointFacts) -> None:
-    """Raise InvalidSampleError for views or a goal that the checkpoint does not read, or views of several cameras."""
+    """Raise InvalidSampleError for views or a goal that the checkpoint cannot read, or views with several cameras."""
     for name in ("views", "goal"):
         value = getattr(options, name)
         if value and not checkpoint.reads_views:
@@ -276,9 +280,9 @@ def _check_views(options: LabelOptions, cameras: Sequence[str], checkpoint: Chec
 
 
 def checked_episodes(dataset: Dataset, options: LabelOptions, watch: Watch = QUIET) -> list[DatasetEpisode]:
-    """Return the chosen episodes, once their tables and frames are checked, without decoding. Others are not read.
+    """Return the chosen episodes after checking tables and frames, without decoding. Other episodes are not read.
 
-    Raises FaultsError with the faults of all of them, and of those of all shards, because all need the same episodes;
+    Raises FaultsError with all faults, including other shards' faults, because every shard needs the same episodes;
     DatasetError for an episode that the dataset lacks.
     """
     numbers, everywhere = (chosen_numbers(dataset, each) for each in (options, replace(options, shard=None)))
@@ -300,13 +304,13 @@ def checked_episodes(dataset: Dataset, options: LabelOptions, watch: Watch = QUI
         checked_episodes(dataset, replace(options, shard=None))  # raises
     if faults:
         raise FaultsError.of(faults, numbers)
-    if options.shard is None:  # the episodes of another shard may need the task
+    if options.shard is None:  # episodes in another shard may need the task
         dataset.given_task.check_used(episodes)
     return episodes
 
 
 def check_order(episodes: Sequence[DatasetEpisode]) -> None:
-    """Raise DatasetError if two episodes share rows, or their rows have another order."""
+    """Raise DatasetError if two episodes share rows, or the rows do not follow episode order."""
     for before, episode in itertools.pairwise(episodes):
         end = before.first_index + before.num_frames
         got = f"{episode.first_index}: renumber the rows in the order of the episodes"
@@ -317,7 +321,7 @@ def check_order(episodes: Sequence[DatasetEpisode]) -> None:
 def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch = QUIET) -> Plan:
     """Check the dataset, report decisions to ``watch``, and return the plan.
 
-    Raises DatasetError, RewardError if the scorer does not answer, ValueError if the rule lacks its number of frames.
+    Raises DatasetError, RewardError if the scorer does not answer, ValueError if the sampling rule needs a frame count.
     """
     recipe = Recipe.of(options, dataset, scorer.checkpoint())
     episodes = checked_episodes(dataset, options, watch)
@@ -345,7 +349,7 @@ def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: 
 
 
 def _tasks_told(dataset: Dataset, episodes: Sequence[DatasetEpisode]) -> list[str]:
-    """Return a line about episodes with the caller's task, and one about tasks that are not sentences."""
+    """Return a line about episodes that use the caller's task, and one about tasks that are not sentences."""
     given, lines = dataset.given_task, []
     if given.overrides:
         lines.append(f"tasks: all {len(episodes)} episodes get --task")
@@ -356,7 +360,7 @@ def _tasks_told(dataset: Dataset, episodes: Sequence[DatasetEpisode]) -> list[st
 
 
 def _identifiers_told(tasks: Iterable[str]) -> list[str]:
-    """Return a line that lists tasks of one ASCII word, such as ``pick_place_cup``; empty if there are none."""
+    """Return a line that lists single-word ASCII tasks, such as ``pick_place_cup``; empty if there are none."""
     known = dict.fromkeys(tasks)
     found = [task for task in known if task.isascii() and len(task.split()) == 1]
     if not found:

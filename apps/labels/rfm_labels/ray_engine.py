@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Label on a Ray cluster: Ray Data hands episodes to actors, and each actor holds a scorer. Needs ``rfm-labels[ray]``.
+"""Label on a Ray cluster: Ray Data hands episodes to actors that each hold a scorer. Needs ``rfm-labels[ray]``.
 
-Ray only schedules. Parts and provenance equal those of a run without Ray, so either run can continue the other. Every
-node must find dataset and parts at the same place: a shared folder, or for the parts a URL.
+Ray only schedules. Parts and provenance equal those from a run without Ray, so either run can continue the other. Every
+node must find the dataset and the parts at the same place: a shared folder or, for the parts, a URL.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from rfm_labels.writing import Parts
 
 Connect: TypeAlias = Callable[[], AbstractContextManager[Scorer]]
 
-_BATCHES_AN_ACTOR = 4  # at least, if there are enough episodes: all actors then end at about the same time
+_BATCHES_AN_ACTOR = 4  # minimum, given enough episodes: all actors then end at about the same time
 _ANY_CLUSTER = RayOptions()
 
 
 @dataclass(frozen=True)
 class RayJob:
-    """The work of all actors.
+    """The work that all actors share.
 
-    source, opening: arguments of ``open_dataset``
+    source, opening: arguments for ``open_dataset``
     connect: returns a context with the actor's scorer
-    parts: folder or URL of the parts
-    workers: episodes in progress at a time in an actor
+    parts: folder or URL for the parts
+    workers: concurrent episodes per actor
     """
 
     source: str
@@ -46,21 +46,21 @@ class RayJob:
 
 
 class EpisodeActor:
-    """An actor that labels batches of episodes. It scores an episode while it decodes the next."""
+    """Labels batches of episodes, scoring one episode while it decodes the next."""
 
     def __init__(self, job: RayJob) -> None:
-        self._held = ExitStack()  # ``__del__`` closes it, also if ``__init__`` fails
+        self._held = ExitStack()  # closed by ``__del__``, also if ``__init__`` fails
         self._job = job
         self._parts = Parts(job.parts)
         self._dataset = open_dataset(job.source, **job.opening)
         self._scorer = self._held.enter_context(job.connect())
 
     def __del__(self) -> None:
-        """Close the scorer: Ray releases an actor's object before the actor ends."""
+        """Close the scorer: Ray releases the actor object before the actor ends."""
         self._held.close()
 
     def __call__(self, batch: Mapping[str, Any]) -> dict[str, list[Any]]:
-        """Label the episodes at these places in the plan. Return a reason for each; empty: no failure."""
+        """Label the episodes at these places in the plan. Return a reason for each; empty if it did not fail."""
         (places,) = batch["places"]
         plan = replace(self._job.plan, items=[self._job.plan.items[int(place)] for place in places])
         failures = Run(plan, self._dataset, self._scorer, self._parts, Watch()).finish_all(self._job.workers)
@@ -101,7 +101,7 @@ def finish_all_with_ray(job: RayJob, options: RayOptions, watch: Watch) -> list[
 def _labelled(ray: Any, job: RayJob, options: RayOptions, places: Sequence[int]) -> Any:
     """The Ray dataset whose rows arrive as batches are labelled."""
     ray.data.DataContext.get_current().enable_progress_bars = False
-    # a batch occupies all workers of an actor, if there are enough episodes
+    # a batch occupies all workers in an actor, given enough episodes
     size = max(1, min(job.workers, len(places) // (options.actors * _BATCHES_AN_ACTOR)))
     batches = [list(places[start : start + size]) for start in range(0, len(places), size)]
     dataset = ray.data.from_items([{"places": batch} for batch in batches], override_num_blocks=len(batches))
@@ -124,12 +124,12 @@ def label_with_ray(
     ray: RayOptions = _ANY_CLUSTER,
     **opening: Any,
 ) -> Report:
-    """Label as ``label`` does, on a Ray cluster. Each actor opens the dataset and connects by itself.
+    """Label like ``label``, on a Ray cluster. Each actor opens the dataset and connects on its own.
 
-    The files tell no cost of this run: actors start and end while others label.
+    The files record no cost for this run: actors start and end while others label.
 
-    source, opening: arguments of ``open_dataset``
-    connect: returns a context with a scorer, on any node; this process reads the checkpoint's facts with it
+    source, opening: arguments for ``open_dataset``
+    connect: returns a context with a scorer, on any node; this process uses it to read the checkpoint's facts
     """
     dataset = open_dataset(source, **opening)
     with connect() as scorer:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Scorers of a labelling run: a server behind a client, or an engine in this process. T frames, H x W pixels."""
+"""Scorers for a labelling run: a server behind a client, or an in-process engine. T frames, H x W pixels."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from rfm_client import (
 )
 from rfm_labels.datasets.stored_files import digest_of
 
-DECISIVE = ("weights_digest", "settings_digest", "computation")  # equal if scores are
+DECISIVE = ("weights_digest", "settings_digest", "computation")  # equal if the scores are
 
 
 @dataclass(frozen=True)
 class CheckpointFacts:
-    """A checkpoint's origin, causes of its scores, and limits. Other fields: as in ``rfm_client.ModelInfo``.
+    """A checkpoint's origin, limits, and what decides its scores. Other fields: as in ``rfm_client.ModelInfo``.
 
-    weights_digest: of the weights
-    settings_digest: of all else that decides the scores: configuration, encoders, dtype, device
+    weights_digest: over the weights
+    settings_digest: over everything else that decides the scores: configuration, encoders, dtype, device
     encodes: True if the checkpoint can encode frames alone, and score prefixes from their embeddings
-    is_causal: True if no frame's score depends on later frames
-    has_progress: False if it predicts remaining seconds in place of progress
-    reads_views: True if it reads views of further cameras and a goal
+    is_causal: True if a frame's score never depends on later frames
+    has_progress: False if it predicts remaining seconds instead of progress
+    reads_views: True if it reads additional camera views and a goal
     """
 
     source: str | None
@@ -52,7 +52,7 @@ class CheckpointFacts:
 
     @classmethod
     def of(cls, described: object, **own: Any) -> CheckpointFacts:
-        """Return the facts of a description, such as a ModelInfo. own: fields that differ from it, or that it lacks"""
+        """Copy the facts from a description, such as a ModelInfo. own: fields that differ from it, or that it lacks."""
         names = [each.name for each in fields(cls) if each.name not in own]
         return cls(**own, **{name: getattr(described, name) for name in names})
 
@@ -60,35 +60,35 @@ class CheckpointFacts:
         """Return the facts for the provenance."""
         told, newer = ("source", "revision", *DECISIVE, "weights"), ("computation", "weights")
         there = {name: value for name, value in asdict(self).items() if name in told}
-        # Labels made before lack the newer fields, and the digests of episodes depend on the provenance.
+        # Older labels lack the newer fields, and episode digests depend on the provenance.
         return {name: value for name, value in there.items() if value is not None or name not in newer}
 
 
 class Scorer(Protocol):
-    """Scores samples with one checkpoint. Several threads use it at a time."""
+    """Scores samples with one checkpoint. Must be thread-safe."""
 
     def checkpoint(self) -> CheckpointFacts:
-        """Return the facts of the checkpoint that answers now. Raises RewardError."""
+        """Return facts about the checkpoint that answers now. Raises RewardError."""
 
     def encode(self, frames: UInt8Array, task: str) -> Trajectory:
-        """Return embeddings of frames, uint8 [T, H, W, 3], and task; needs ``encodes``. Raises RewardError."""
+        """Return embeddings for frames, uint8 [T, H, W, 3], and task; needs ``encodes``. Raises RewardError."""
 
     def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
-        """Return the result of each sample. Raises RewardError for the first failure."""
+        """Return one result per sample. Raises RewardError for the first failure."""
 
 
 class ClientScorer:
-    """A scorer that asks the servers of a client. It leaves the client open."""
+    """A scorer that asks a client's servers. Leaves the client open."""
 
     def __init__(self, client: RewardClient) -> None:
         self._client = client
 
     def checkpoint(self) -> CheckpointFacts:
-        """Return the facts from the servers. Raises RewardError, also if the servers have different checkpoints."""
+        """Ask the servers for the facts. Raises RewardError, also if the servers have different checkpoints."""
         infos = self._client.model_infos()
         digests: list[object] = [_digests(told) for told in infos.values()]
         info = infos["frames"][0] if "frames" in infos else self._client.model_info(frames=True)
-        # Labels without the column of a newer score cannot be joined with its own. The first such score was a mark.
+        # Labels with and without a newer score's column cannot be joined. The first such score was a mark.
         digests += [f"marks_{name}" for name in info.scores if FRAME_SCORES[name].is_newer]
         if info.weights_digest is None:
             raise InvalidSampleError.at(
@@ -104,16 +104,16 @@ class ClientScorer:
         )
 
     def encode(self, frames: UInt8Array, task: str) -> Trajectory:
-        """Return embeddings of frames, uint8 [T, H, W, 3], and task. Raises RewardError."""
+        """Return embeddings for frames, uint8 [T, H, W, 3], and task. Raises RewardError."""
         return self._client.encode(Trajectory(frames=frames, task=task))
 
     def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
-        """Return the result of each sample. Raises RewardError for the first failure."""
+        """Return one result per sample. Raises RewardError for the first failure."""
         return cast("list[ProgressResult]", self._client.evaluate(samples, all_scores=True))
 
 
 def _digests(infos: Sequence[ModelInfo]) -> tuple[str, str | None, str | None]:
-    """Return name and digests of a model. Raises InvalidSampleError if servers differ in these or the computation."""
+    """Return a model's name and digests. Raises InvalidSampleError if servers differ in DECISIVE fields."""
     digests = {(info.name, *(getattr(info, name) for name in DECISIVE)) for info in infos}
     if len(digests) > 1:
         told = " and ".join(sorted(", ".join(map(str, values)) for _, *values in digests))

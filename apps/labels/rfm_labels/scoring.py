@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Score the episodes of a plan that have no part yet, several at a time. T frames, H x W pixels.
+"""Score episodes that have no part yet, several at a time. T frames, H x W pixels.
 
-Each camera of an episode is decoded once, its frames are scored, and the scores of the cameras are fused.
+For each camera, an episode is decoded once and its frames are scored. Then the camera scores are fused.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ from rfm_labels.plan import Item, Plan, Recipe
 from rfm_labels.scorer import DECISIVE, Scorer
 from rfm_labels.writing import Parts
 
-FRAMES_AT_A_TIME = 64  # in a request to the encoder, as in its forward pass
-MAX_BYTES = 32 * 2**20  # of the samples in one call of the scorer
-MAX_FRAME_BYTES = 2 * 2**30  # of all workers of a process
+FRAMES_AT_A_TIME = 64  # per encoder request, as in the encoder's forward pass
+MAX_BYTES = 32 * 2**20  # for the samples in one scorer call
+MAX_FRAME_BYTES = 2 * 2**30  # for all workers in the process
 
 _NOT_ABOUT_ONE_EPISODE = (ServerUnavailableError, DeadlineExceededError, ModelNotFoundError, AccessDeniedError)
 
 
 @dataclass(frozen=True)
 class FailedEpisode:
-    """An episode without labels, and the reason."""
+    """An episode that got no labels, and why."""
 
     episode: DatasetEpisode
     error: RewardError
@@ -65,7 +65,7 @@ class _StoppedError(RewardError):
 
 
 class Run:
-    """The labelling of a plan with threads of this process."""
+    """Labels a plan with threads in this process."""
 
     def __init__(self, plan: Plan, dataset: Dataset, scorer: Scorer, parts: Parts, watch: Watch) -> None:
         self._plan, self._dataset, self._scorer, self._parts, self._watch = plan, dataset, scorer, parts, watch
@@ -78,13 +78,13 @@ class Run:
 
     @property
     def cost(self) -> Cost | None:
-        """What ``finish_all`` scored, and its time; None: it scored nothing."""
+        """The frames that ``finish_all`` scored, and the time taken; None: scored nothing."""
         return Cost(self._frames_scored, self._seconds) if self._frames_scored else None
 
     def finish_all(self, workers: int) -> list[FailedEpisode]:
         """Label all items without a part, ``workers`` at a time, and return the failures.
 
-        Raises, once the episodes in progress have ended, RewardError if the server is gone, OSError for a full disk.
+        Raises RewardError if the server is gone, OSError if the disk is full, after the current episodes have ended.
         """
         pending = unfinished(self._plan, self._parts, self._watch)
         began_s = time.monotonic()
@@ -109,7 +109,7 @@ class Run:
         except _StoppedError:
             return
         except RewardError as error:
-            is_of_one = isinstance(error, ProcessEndedError)  # at both tries of the client
+            is_of_one = isinstance(error, ProcessEndedError)  # the client's retry failed as well
             if isinstance(error, _NOT_ABOUT_ONE_EPISODE) and not is_of_one:
                 self._stop(error)
                 return
@@ -123,7 +123,7 @@ class Run:
         recipe, memory = self._plan.recipe, self._memory
         try:
             scores = episode_scores(self._dataset, item.episode, self._scorer, recipe, memory=memory, go_on=self._go_on)
-        except InferenceFailedError:  # the cause may be a new checkpoint
+        except InferenceFailedError:  # perhaps another checkpoint is served now
             self._check_checkpoint()
             raise
         self._check_checkpoint()
@@ -132,7 +132,7 @@ class Run:
             self._frames_scored += item.episode.num_frames
 
     def _check_checkpoint(self) -> None:
-        """Stop the run and raise _StoppedError if another checkpoint is served now."""
+        """Stop the run and raise _StoppedError if the server now has another checkpoint."""
         try:
             planned, now = self._plan.recipe.checkpoint, self._scorer.checkpoint()
             for name in DECISIVE:
@@ -153,23 +153,23 @@ class Run:
 
 
 def unfinished(plan: Plan, parts: Parts, watch: Watch) -> list[Item]:
-    """Return the items without a part, and report the number of frames to ``watch``."""
+    """Return the items without a part, and report frame counts to ``watch``."""
     finished = parts.finished(plan.items)
     watch.begin(plan.num_frames, sum(item.episode.num_frames for item in plan.items if item.key in finished))
     return [item for item in plan.items if item.key not in finished]
 
 
 def by_episode(failures: Sequence[FailedEpisode]) -> list[FailedEpisode]:
-    """Return the failures in the order of their episodes."""
+    """Return the failures in episode order."""
     return sorted(failures, key=lambda failure: failure.episode.index)
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodeScores:
-    """The scores of an episode.
+    """The scores for one episode.
 
-    columns: columns of the labels, float32 [T] each
-    blank: highest value of the frames of each camera that shows nothing, as in ``BlankFrames``
+    columns: label columns, float32 [T] each
+    blank: brightest value for each camera that shows nothing, as in ``BlankFrames``
     """
 
     columns: Columns
@@ -177,7 +177,7 @@ class EpisodeScores:
 
 
 class FrameMemory:
-    """A limit on the bytes of frames that all workers hold together; a larger video is held alone."""
+    """Limits how many bytes of frames all workers hold together; a larger video is held alone."""
 
     def __init__(self, max_bytes: int = MAX_FRAME_BYTES) -> None:
         self._max_bytes = max_bytes
@@ -193,7 +193,7 @@ class FrameMemory:
         try:
             yield
         except Exception as error:
-            clear_frames(error.__traceback__)  # otherwise the error's traceback keeps the frames in memory
+            clear_frames(error.__traceback__)  # otherwise the traceback keeps the frames in memory
             raise
         finally:
             with self._changed:
@@ -210,15 +210,15 @@ def episode_scores(
     memory: FrameMemory,
     go_on: Callable[[], None],
 ) -> EpisodeScores:
-    """Return the scores of an episode, and its cameras that show nothing. Raises RewardError.
+    """Return an episode's scores and blank cameras. Raises RewardError.
 
-    Columns: ``progress``, and each other score of ``SCORES`` that the checkpoint gives; a mark is 1 if a camera's is.
-    Several cameras add ``progress.<camera>`` and so on.
+    Columns: ``progress``, and every other score in ``SCORES`` that the checkpoint gives; a mark is 1 if it is 1 for any
+    camera. Several cameras add ``progress.<camera>`` and so on.
 
-    memory: shared by all workers, for the frames of one camera at a time; unused if the checkpoint encodes frames
-    go_on: called between requests; its exception ends the episode
+    memory: shared by all workers, for one camera's frames at a time; unused if the checkpoint encodes frames
+    go_on: called between requests; may raise to end the episode
 
-    Each stretch of frames with one task is scored by itself, as an episode of this task.
+    Each stretch of frames with one task is scored separately, as an episode with this task.
     """
     by_camera: dict[str, list[ProgressResult]] = {}
     shown = {camera: BlankFrames() for camera in recipe.decoded_cameras}
@@ -227,7 +227,7 @@ def episode_scores(
             _checked(dataset.frames(episode, each), episode, each, shown[each]) for each in (camera, *recipe.views)
         ]
         for number, (task, count) in enumerate(episode.stretches, 1):
-            is_last = number == len(episode.stretches)  # reads on, to find frames too many
+            is_last = number == len(episode.stretches)  # reads on, to detect surplus frames
             stretch = together if is_last else [itertools.islice(frames, count) for frames in together]
             chunks = [_shrunk(frames, recipe, go_on) for frames in stretch]
             if recipe.checkpoint.encodes:
@@ -253,7 +253,7 @@ def _columns(by_camera: Mapping[str, Sequence[ProgressResult]], episode: Dataset
             continue
         _check_numbers(name, scores, [each.is_answered for each in joined], episode)
         fuse: Any = np.max if about.mark else getattr(np, recipe.fuse)  # mean, min or max
-        sign = np.float32(1 if about.higher_is_better else -1)  # so that min is the worst camera
+        sign = np.float32(1 if about.higher_is_better else -1)  # so that min selects the worst camera
         columns[name] = sign * np.asarray(fuse(sign * np.stack(scores), axis=0), np.float32)
         if len(by_camera) > 1:
             columns |= {f"{name}.{camera}": score for camera, score in zip(by_camera, scores, strict=True)}
@@ -272,7 +272,7 @@ def _scores(trajectory: Trajectory, scorer: Scorer, recipe: Recipe, go_on: Calla
 
 
 def _with_progress(result: ProgressResult, recipe: Recipe) -> ProgressResult:
-    """Return the result with progress by the recipe's rule, if it has one. Raises InvalidSampleError."""
+    """Derive progress by the recipe's rule, if it has one. Raises InvalidSampleError."""
     if recipe.progress_rule is None:
         return result
     try:
@@ -282,7 +282,7 @@ def _with_progress(result: ProgressResult, recipe: Recipe) -> ProgressResult:
 
 
 def _shrunk(frames: Iterator[UInt8Array], recipe: Recipe, go_on: Callable[[], None]) -> Iterator[UInt8Array]:
-    """Yield arrays of at most FRAMES_AT_A_TIME frames, resized if the recipe says so."""
+    """Yield arrays with at most FRAMES_AT_A_TIME frames, resized if the recipe says so."""
     while chunk := list(itertools.islice(frames, FRAMES_AT_A_TIME)):
         go_on()
         stacked = np.stack(chunk)
@@ -299,7 +299,7 @@ def _joined(parts: Sequence[Trajectory]) -> Trajectory:
 def _held(
     firsts: Sequence[UInt8Array], others: Sequence[Iterator[UInt8Array]], task: str, count: int, recipe: Recipe
 ) -> Trajectory:
-    """Return the trajectory of a camera and the views, from the first chunk of each and an iterator of the others."""
+    """Return a trajectory for camera and views, given each one's first chunk and an iterator over the rest."""
     frames, *views = (_filled(first, chunks, count) for first, chunks in zip(firsts, others, strict=True))
     goal = None if recipe.goal is None else recipe.goal.picture(frames)
     if goal is not None and recipe.resize and recipe.checkpoint.frame_size is not None:
@@ -317,7 +317,7 @@ def _filled(first: UInt8Array, others: Iterator[UInt8Array], count: int) -> UInt
 
 
 def _by_bytes(samples: Iterable[ProgressSample]) -> Iterator[list[ProgressSample]]:
-    """Yield lists of samples, each of at most MAX_BYTES or a single sample."""
+    """Group samples into lists that hold at most MAX_BYTES or a single sample."""
     together: list[ProgressSample] = []
     num_bytes = 0
     for sample in samples:
@@ -333,7 +333,7 @@ def _by_bytes(samples: Iterable[ProgressSample]) -> Iterator[list[ProgressSample
 def _checked(
     frames: Iterator[UInt8Array], episode: DatasetEpisode, camera: str, shown: BlankFrames
 ) -> Iterator[UInt8Array]:
-    """Yield the frames, counted in ``shown``. Raises DatasetError for a wrong number of frames, or several sizes."""
+    """Yield frames and record them in ``shown``. Raises DatasetError if their count is wrong or sizes differ."""
     where, count, shape = f"{episode.name}: {camera}", 0, None
     for frame in frames:
         shape = shape or frame.shape
@@ -348,7 +348,7 @@ def _checked(
 def _check_numbers(
     name: str, scores: Sequence[Float32Array], answered: Sequence[npt.NDArray[np.bool_]], episode: DatasetEpisode
 ) -> None:
-    """Raise InferenceFailedError unless each camera has numbers at the frames that the model answered about."""
+    """Raise InferenceFailedError unless every camera has finite scores wherever the model answered."""
     for score, there in zip(scores, answered, strict=True):
         if score.shape != (episode.num_frames,) or not np.isfinite(score[there]).all():
             got = "NaN: this checkpoint does not predict it" if np.isnan(score).any() else str(list(score.shape))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Summary of a label file. Needs pyarrow. E episodes."""
+"""Summarise a label file. Needs pyarrow. E episodes."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from rfm_labels.datasets.faults import require
 from rfm_labels.label_files import read_label_table
 from rfm_labels.metadata import PROGRESS, SUCCESS
 
-BACKWARDS_BY = 0.01  # kappa of reward-aligned behaviour cloning; a smaller fall is noise
+BACKWARDS_BY = 0.01  # kappa in reward-aligned behaviour cloning; a smaller fall is noise
 VOTING_FRAMES = 3  # at an episode's end: a single frame may be an accident
 _MOST_LISTED = 12
 
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """Scores of each episode.
+    """Scores per episode.
 
-    episodes: int64 [E], numbers of the episodes
+    episodes: int64 [E], episode numbers
     final_progress: float32 [E], at the last frame
     best_success: float32 [E], highest success; None: the checkpoint does not predict success
     last_success: float32 [E], success at the last frame; None as ``best_success``
     voted_success: float32 [E], as ``voted_success`` returns it; None as ``best_success``
     backwards: float64 [E], share of steps on which progress falls by more than 0.01
-    disagreement: float64 [E], range of the cameras' progress, mean over frames; None: no scores of several cameras
-    num_frames: of all episodes
+    disagreement: float64 [E], range of progress over cameras, averaged over frames; None: no separate camera scores
+    num_frames: total over all episodes
     """
 
     episodes: npt.NDArray[np.int64]
@@ -46,7 +46,7 @@ class Summary:
 
     @property
     def outcomes(self) -> dict[str, npt.NDArray[np.bool_]]:
-        """bool [E] for each outcome, True at the episodes that have it; empty: success is not predicted.
+        """bool [E] by outcome name; empty if success is not predicted.
 
         An episode succeeds if most of its last three frames have a success of 0.5 or more.
         """
@@ -56,7 +56,7 @@ class Summary:
         return {"succeed": succeeds, "succeed, then undo it": ever & ~succeeds, "never succeed": ~ever}
 
     def rows(self) -> list[tuple[str, str]]:
-        """Return name and value of each row of a table."""
+        """Return names and values for a table."""
         quantiles = np.quantile(self.final_progress, [0, 0.25, 0.5, 0.75, 1])
         names = ("lowest", "lower quarter", "median", "upper quarter", "highest")
         told = {}
@@ -80,21 +80,21 @@ def voted_success(success: Float32Array) -> float:
 
 
 def summarise(file: Path) -> Summary:
-    """Return the summary of a label file. Raises DatasetError for another file."""
+    """Summarise a label file. Raises DatasetError if it is not one."""
     table = read_label_table(file)
     require(file, len(table) > 0, "labels", "none")
     return summary_of(table)
 
 
 def summary_of(labels: Any) -> Summary:
-    """Return the summary of labels, a pyarrow Table with the parts' column names."""
+    """Summarise labels, a pyarrow Table with the parts' column names."""
     episodes = labels["episode_index"].to_numpy()
     starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1)).tolist()
     numbers, final, best, last, voted, backwards, apart = [], [], [], [], [], [], []
     for start, end in zip(starts, [*starts[1:], len(labels)], strict=True):
         table = labels.slice(start, end - start)
         progress = table[PROGRESS].to_numpy()
-        is_scored = np.isfinite(progress)  # NaN: the model did not answer about the frame
+        is_scored = np.isfinite(progress)  # NaN: the model did not answer
         final.append(progress[-1])
         progress = progress[is_scored]
         cameras = [table[name].to_numpy()[is_scored] for name in table.column_names if name.startswith(f"{PROGRESS}.")]

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Write labels: a part for each finished episode, then Parquet files for a whole dataset. Needs pyarrow and fsspec.
+"""Write labels: one part per finished episode, then Parquet files for the whole dataset. Needs pyarrow and fsspec.
 
-A part is a Parquet file in a folder or at an fsspec URL, and exists whole or not at all. Its name has the digest of
-everything that decides its labels, so any run may use it.
+A part is a Parquet file in a folder or at an fsspec URL. Writes are atomic. The file name contains a digest over
+everything that decides the labels, so any run may reuse the part.
 
-``<name>_progress.parquet``: the format of LeRobot's reward-aligned behaviour cloning and of the Hub's visualizer.
-Columns: int64 ``index``, ``episode_index``, ``frame_index``, then float32 ``progress_sparse``, ``success``, and those
-of each camera. If an episode has several tasks, ``progress`` is each frame's own, and ``progress_sparse`` the sum of
-what all tasks have gained. If the model skips frames, ``progress`` is NaN there, and ``progress_sparse`` filled.
+``<name>_progress.parquet``: the format that LeRobot's reward-aligned behaviour cloning and the Hub's visualizer read.
+Columns: int64 ``index``, ``episode_index``, ``frame_index``, then float32 ``progress_sparse``, ``success``, and one set
+per camera. If an episode has several tasks, ``progress`` restarts with each task, and ``progress_sparse`` adds up the
+gains. If the model skips frames, ``progress`` is NaN there, and ``progress_sparse`` is interpolated.
 
 ``reward_signals/<name>.parquet``: LeRobot's frame signals (schema version 1), as its open pull requests propose them.
-Columns: the same int64 columns, then float32 ``reward.<name>.progress``, ``reward.<name>.success_probability``, and
-those of each camera. The metadata describes each score column.
+Columns: the same int64 columns, then float32 ``reward.<name>.progress``, ``reward.<name>.success_probability``, and one
+set per camera. The metadata describes each score column.
 """
 
 from __future__ import annotations
@@ -44,30 +44,32 @@ from rfm_labels.metadata import (
 from rfm_labels.options import Fill
 from rfm_labels.plan import Item, Plan
 
-IDENTITY = ("index", "episode_index", "frame_index")  # columns of every table of labels
+IDENTITY = ("index", "episode_index", "frame_index")  # columns in every label table
 PROGRESS_ENDING = "_progress.parquet"
 PROVENANCE_KEY = b"rfm.provenance"
 SIGNALS_PROVENANCE_KEY = b"lerobot.reward_scoring.provenance"
-EPISODES_KEY = b"rfm.episodes"  # each episode's digest, by which a later run sees if its labels still hold
-FILL_KEY = b"rfm.progress_sparse_fill"  # rule of the frames that the model skipped, if it skipped any
-COST_KEY = b"rfm.cost"  # apart from the provenance, which is equal for equal runs
+EPISODES_KEY = b"rfm.episodes"  # digest per episode: a later run compares them to see whether the labels still hold
+FILL_KEY = b"rfm.progress_sparse_fill"  # how skipped frames were filled; absent if the model skipped none
+COST_KEY = b"rfm.cost"  # not in the provenance, which must be equal for equal runs
 SIGNAL_NAMES = {**{name: name for name in SCORES}, SUCCESS: "success_probability", REMAINING: "remaining_time_s"}
 _POTENTIAL, _IS_SCORED = "potential", "is_inference_frame"
-_DERIVED = {  # further signals, with their meaning
+_DERIVED = {  # further signals and what they mean
     _POTENTIAL: "Minus the remaining seconds",
     _IS_SCORED: "1 where the model scored the frame itself",
 }
 
 _DIGEST_KEY = b"rfm.digest"
 _SUFFIX = ".parquet"
-_ROWS_AT_A_TIME = 2**17  # in a row group
-_TOTAL = "total"  # progress added up over the tasks of an episode
+_ROWS_AT_A_TIME = 2**17  # per row group
+_TOTAL = "total"  # progress summed over an episode's tasks
 
 
 class Parts:
-    """The parts of a labelling run. Raises ImportError for a missing package, OSError for a place without write access.
+    """The parts written by a labelling run.
 
     url: a folder, or an fsspec URL, for example ``s3://bucket/folder``
+
+    Raises ImportError if a package is missing, OSError if the place is not writable.
     """
 
     def __init__(self, url: str) -> None:
@@ -84,7 +86,7 @@ class Parts:
             self._fs.makedirs(self._root, exist_ok=True)
 
     def finished(self, items: Sequence[Item]) -> set[str]:
-        """Return the keys of the items whose parts exist."""
+        """Return the keys of items whose parts exist."""
         self._fs.invalidate_cache()
         names = {path.rpartition("/")[2] for path in self._fs.ls(self._root, detail=False)}
         return {item.key for item in items if item.key + _SUFFIX in names}
@@ -94,7 +96,10 @@ class Parts:
         return bool(self._fs.exists(self._path(item)))
 
     def write(self, item: Item, columns: Columns, blank: Mapping[str, int]) -> None:
-        """Write the item's part, whole or not at all. Raises OSError. columns, blank: as in ``EpisodeScores``"""
+        """Write the item's part atomically. Raises OSError.
+
+        columns, blank: as in ``EpisodeScores``
+        """
         import pyarrow as pa
         from pyarrow import parquet
 
@@ -110,16 +115,16 @@ class Parts:
                 with whole_files(Path(self._path(item))) as (file,):
                     file.write_bytes(content.getvalue())
             else:
-                self._fs.pipe_file(self._path(item), content.getvalue())  # object stores show only whole objects
+                self._fs.pipe_file(self._path(item), content.getvalue())  # object stores never show partial objects
 
     def read(self, item: Item) -> Any:
-        """Return the item's part, a pyarrow Table. Raises DatasetError if it is missing, damaged or of another item."""
+        """Read the item's part as a pyarrow Table. Raises DatasetError if it is missing, damaged or another item's."""
         import pyarrow as pa
         from pyarrow import parquet
 
         path = self._path(item)
         try:
-            # no Arrow threads: a thread that releases Python's bytes while the interpreter ends aborts the process
+            # no Arrow threads: one that releases Python bytes during interpreter shutdown aborts the process
             part = parquet.ParquetFile(pa.BufferReader(self._fs.cat_file(path)), pre_buffer=False)
             table = part.read(use_threads=False)
         except FileNotFoundError as error:
@@ -133,9 +138,9 @@ class Parts:
         return table
 
     def read_all(self, plan: Plan) -> Any:
-        """Return a pyarrow Table with the rows of all items of a plan, in order, and the blank cameras as metadata.
+        """Return a pyarrow Table with the rows for all items in the plan, in order, and the blank cameras as metadata.
 
-        Raises DatasetError for a part that is missing, damaged, out of order, or has other columns than the first part.
+        Raises DatasetError if a part is missing, damaged or out of order, or has other columns than the first.
         """
         import pyarrow as pa
 
@@ -168,9 +173,9 @@ class Parts:
 
 @contextmanager
 def whole_files(*targets: Path) -> Iterator[list[Path]]:
-    """Yield a file to write for each target. After the block, once all are on the disk, each replaces its target.
+    """Yield a temporary file for each target. After the block, sync all files to disk, then replace the targets.
 
-    After an exception in the block, or a failed write, no target has changed.
+    If the block raises or a write fails, all targets stay unchanged.
     """
     written = [target.with_name(f".tmp-{uuid.uuid4().hex}") for target in targets]
     try:
@@ -189,8 +194,8 @@ def whole_files(*targets: Path) -> Iterator[list[Path]]:
 class Sidecar:
     """A Parquet label file to write.
 
-    columns: each score column's name in the file, by its name in the parts
-    metadata: of the Parquet schema
+    columns: maps column names in the parts to column names in the file
+    metadata: for the Parquet schema
     """
 
     path: Path
@@ -199,7 +204,11 @@ class Sidecar:
 
 
 def progress_file(path: Path, plan: Plan, columns: Sequence[str], cost: Cost | None, fill: Fill) -> Sidecar:
-    """Return the progress file for these columns of the parts. cost: None: unknown; fill: as in ``LabelOptions``"""
+    """Return the progress file for these part columns.
+
+    cost: None: unknown
+    fill: as in ``LabelOptions``
+    """
     checkpoint = plan.recipe.checkpoint
     model = checkpoint.source or checkpoint.weights_digest
     metadata = {
@@ -216,18 +225,18 @@ def progress_file(path: Path, plan: Plan, columns: Sequence[str], cost: Cost | N
 
 
 def is_filled(columns: Sequence[str], fill: Fill) -> bool:
-    """True if the model skipped frames, at which ``progress_sparse`` is filled. columns: of the parts"""
+    """True if the model skipped frames and ``progress_sparse`` is filled there. columns: from the parts."""
     return fill == "linear" and skipping_in(columns) is not None
 
 
 def with_totals(labels: Any, plan: Plan, fill: Fill) -> Any:
     """Return the labels with all columns that the label files need.
 
-    labels: table of ``Parts.read_all``; fill: as in ``LabelOptions``
+    labels: table from ``Parts.read_all``; fill: as in ``LabelOptions``
 
-    Reward-aligned behaviour cloning weights a frame by the difference of two frames' progress, and 0 if it falls. Where
-    an episode's task changes, progress begins anew, so the sum of all tasks' gains takes its place. A frame without
-    progress gets the weight 1 from it, so the frames that the model skipped are filled.
+    Reward-aligned behaviour cloning weights a frame by the progress between two frames, or 0 if progress falls.
+    Progress restarts when an episode's task changes, so ``progress_sparse`` sums the gains over all tasks. A frame
+    without progress would get weight 1, so skipped frames are filled.
     """
     import pyarrow as pa
 
@@ -248,7 +257,7 @@ def with_totals(labels: Any, plan: Plan, fill: Fill) -> Any:
         end = begin + item.episode.num_frames
         for first, _ in item.episode.tasks[1:]:
             own = slice(begin + first, end)
-            begun = np.nan_to_num(progress[own.start])  # of a model that compares frames: 0, before its first answer
+            begun = np.nan_to_num(progress[own.start])  # NaN before the first answer if the model compares frames
             total[own] = progress[own] - begun + total[own.start - 1]
         if is_filled(labels.column_names, fill):
             total[begin:end] = _filled(total[begin:end])
@@ -257,7 +266,7 @@ def with_totals(labels: Any, plan: Plan, fill: Fill) -> Any:
 
 
 def _filled(progress: Float32Array) -> Float32Array:
-    """Return an episode's progress, [T], with lines between the answers, as LeRobot's ``interpolate_progress``.
+    """Interpolate an episode's progress, [T], linearly between answers, like LeRobot's ``interpolate_progress``.
 
     The model measures its first answer from the first frame, whose progress is 0.
     """
@@ -272,7 +281,7 @@ def _has_several_tasks(plan: Plan) -> bool:
 
 
 def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str, cost: Cost | None) -> Sidecar:
-    """Return the file of frame signals for these columns of the parts. cost: None: unknown"""
+    """Return the frame signal file for these part columns. cost: None: unknown."""
     signals = {}
     for column in columns:
         score, dot, camera = column.partition(".")
@@ -301,7 +310,7 @@ def _of_run(plan: Plan, cost: Cost | None) -> dict[bytes, bytes]:
 
 
 def _descriptor(column: str, skipping: str | None) -> dict[str, Any]:
-    """skipping: as ``skipping_in`` returns it"""
+    """Return a signal's metadata. skipping: as ``skipping_in`` returns it."""
     name, _, camera = column.partition(".")
     score = SCORES.get(name)
     meaning = _DERIVED[name] if score is None else score.meaning
@@ -312,16 +321,16 @@ def _descriptor(column: str, skipping: str | None) -> dict[str, Any]:
         "bounds": [None, None] if score is None else [*score.bounds],
         "unit": None,
         "missing_values": "nan" if has_gaps else "forbidden",
-        "allow_nan": has_gaps,  # the same in another revision of the proposal
+        "allow_nan": has_gaps,  # same meaning, in another revision of the proposal
     }
 
 
 def write_sidecars(labels: Any, sidecars: Sequence[Sidecar]) -> None:
-    """Write new files with the labels, read them back, then put one after the other in place.
+    """Write the labels to new files, read them back, then move them into place one by one.
 
-    labels: table of ``Parts.read_all``
+    labels: table from ``Parts.read_all``
 
-    Raises OSError for a failed write, and for a file that reads back otherwise; no file has changed then.
+    Raises OSError if a write fails or a file reads back differently; existing files then stay unchanged.
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -341,7 +350,7 @@ def write_sidecars(labels: Any, sidecars: Sequence[Sidecar]) -> None:
 
 
 def _holds(file: Path, table: Any) -> bool:
-    """True if a file has the rows, values and metadata of a table."""
+    """True if the file's rows, values and metadata equal the table's."""
     from pyarrow import ArrowException, parquet
 
     try:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Parts of a command that labels a dataset, as ``rfm-client label`` and ``rfm label``. Needs typer and rich.
+"""Shared parts for commands that label a dataset: ``rfm-client label`` and ``rfm label``. Needs typer and rich.
 
-A command takes ``DatasetArgument``, ``EpisodeTexts``, ``LabelOptions``, ``RunOptions`` and ``RayOptions`` (both of
-``rfm_labels``) as parameters, and hands them to ``LabelCommand`` with a function that connects to a scorer.
+A command takes ``DatasetArgument``, ``EpisodeTexts``, ``RunOptions``, and ``rfm_labels``' ``LabelOptions`` and
+``RayOptions`` as parameters. It passes them to ``LabelCommand``, with a function that connects to a scorer.
 """
 
 from rfm_labels.commands.label import DatasetArgument, EpisodeTexts, LabelCommand, RunOptions

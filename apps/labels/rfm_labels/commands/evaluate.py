@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm-client evaluate``: which of several reward models suits a dataset, from their label files."""
+"""``rfm-client evaluate``: compare reward models by their label files to see which one suits a dataset."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LEGEND = (
 
 @dataclass(frozen=True)
 class EvaluationOutput(PlotOutput):
-    """Files with an evaluation."""
+    """Output files for an evaluation."""
 
     plot: Path | None = setting(
         None, "Draw histograms of progress at the last frame: .png, .pdf or .svg.", metavar="FILE"
@@ -78,7 +78,7 @@ def evaluate(
 
 
 def _print_tables(comparison: LabelComparison) -> None:
-    """Print a table of the models, and a table of each pair's agreement."""
+    """Print one table for the models, and one for pairwise agreement."""
     known, rows = comparison.is_success, []
     columns = ["labels", "VOC rho", "VOC tau", "no VOC", "final", "falls", "frames/s"]
     if known is not None:
@@ -110,7 +110,7 @@ def _print_tables(comparison: LabelComparison) -> None:
 
 
 def document(comparison: LabelComparison) -> dict[str, Any]:
-    """Return the document of ``evaluate --json``."""
+    """Return the document for ``evaluate --json``."""
     evaluations = []
     for each in comparison.evaluations:
         fields = asdict(each)

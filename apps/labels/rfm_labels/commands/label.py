@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm-client label``: label every frame of a dataset. ``rfm label`` shares its parts."""
+"""``rfm-client label``: label every frame in a dataset. ``rfm label`` reuses this code."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from rfm_labels.summary import Summary, summarise
 
 SPEED_OVER_S = 600.0  # an episode may take minutes
 Say: TypeAlias = Callable[[str], None]
-_OF_CAMERAS = ("orient", "channels")  # options with a value for each camera
+_OF_CAMERAS = ("orient", "channels")  # options with a value per camera
 DatasetArgument = Annotated[
     str,
     typer.Argument(
@@ -45,7 +45,7 @@ DatasetArgument = Annotated[
 
 
 class ProgressBar(Watch):
-    """Lines on standard error and, on a terminal, a bar with frames a second and the time left."""
+    """Writes notes to standard error and, on a terminal, shows a bar with speed and remaining time."""
 
     def __init__(self, say: Say) -> None:
         from rich.console import Console
@@ -80,7 +80,7 @@ class ProgressBar(Watch):
         self._say(f"note: {text}")
 
     def checking(self, num_episodes: int) -> None:
-        """Begin to count checked episodes."""
+        """Start counting checked episodes."""
         self._begin("checking episodes", num_episodes, 0)
 
     def checked(self, episode: DatasetEpisode) -> None:
@@ -88,7 +88,7 @@ class ProgressBar(Watch):
         self._advance(1)
 
     def begin(self, num_frames: int, num_finished: int) -> None:
-        """Begin to count labelled frames."""
+        """Start counting labelled frames."""
         if num_finished:
             self.note(f"{num_finished} of {num_frames} frames are labelled already")
         self.num_begun = num_frames
@@ -160,7 +160,7 @@ class EpisodeTexts(Settings):
 
     @property
     def opening(self) -> dict[str, Any]:
-        """Arguments of ``open_dataset`` after the source."""
+        """Keyword arguments for ``open_dataset``."""
         given = {each.name: getattr(self, each.name) for each in fields(self)}
         return given | {option: parsed_by_camera(option, given[option]) for option in _OF_CAMERAS}
 
@@ -207,11 +207,11 @@ def label(
 
 @dataclass(frozen=True)
 class LabelCommand:
-    """A labelling command's run: label, try, or only show the summary.
+    """Runs a labelling command: label, try, or only show the summary.
 
     source: as in ``open_dataset``
     connect: returns a context with a scorer
-    say: takes a line for the user
+    say: prints a line for the user
     """
 
     source: str
@@ -235,7 +235,7 @@ class LabelCommand:
         return self._tell(self._label())
 
     def _run_each(self, files: Sequence[Path]) -> ExitCode:
-        """Run for each HDF5 file of a folder, once all can be opened. Raises DatasetError for a file that cannot."""
+        """Run for each HDF5 file in a folder, once all can be opened. Raises DatasetError if one cannot."""
         stems = [file.stem for file in files]
         twice = [str(file) for file in files if stems.count(file.stem) > 1]
         got = f"{', '.join(twice)}: leave out --output, and labels lie beside their files"
@@ -249,9 +249,9 @@ class LabelCommand:
         return next((code for code in codes if code is not ExitCode.OK), ExitCode.OK)
 
     def _checked(self, commands: Sequence[LabelCommand]) -> list[LabelCommand]:
-        """Return the commands, with --task for the files that need it alone.
+        """Return the commands, keeping --task only for the files that need it.
 
-        Raises FaultsError with the faults of all files, UnusedTaskError if no file needs --task.
+        Raises FaultsError with the faults in all files, UnusedTaskError if no file needs --task.
         """
         lines, unused, checked = [], [], []
         for command in commands:
@@ -320,7 +320,7 @@ class LabelCommand:
         return ExitCode.OK
 
     def _report(self) -> None:
-        """Show the summary of existing labels; the source is a dataset or a label file."""
+        """Show the summary for existing labels; the source is a dataset or a label file."""
         path = Path(self.source)
         if label_prefix(path) or path.is_dir() or self.labels.output is not None:
             folder = self.labels.output or (path if path.is_dir() else path.parent)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Kinds of datasets, for programs that show more of them than ``rfm_labels.Dataset`` has."""
+"""Dataset classes, for programs that show more than ``rfm_labels.Dataset`` offers."""
 
 from rfm_labels.datasets.hdf5 import Hdf5Dataset
 from rfm_labels.datasets.hdf5_layouts import opened_hdf5

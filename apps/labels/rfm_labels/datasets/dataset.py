@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Interface of a dataset: episodes with their tasks, each camera's frames on demand, and corrections of frames.
+"""Dataset interface: episodes with their tasks, camera frames on demand, and frame corrections.
 
-T frames of an episode, H x W pixels.
+T frames per episode, H x W pixels.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from rfm_client.frames import ChannelOrder, Correction, Orientation
 from rfm_client.options import ConfigError, is_blank
 from rfm_labels.datasets.faults import DatasetError, FaultsError, MissingTaskError, UnusedTaskError, require
 
-LEAST_SIZE_PX = 8  # of a side; a smaller array of numbers is no picture
+LEAST_SIZE_PX = 8  # per side; a smaller numeric array is no picture
 _WORDS = frozenset(
     {"depth", "depths", "disparity", "flow", "instance", "instances", "mask", "masks", "normal", "normals"}
     | {"panoptic", "seg", "segm", "segmentation", "segmentations", "segs", "semantic", "semantics"}
 )
-_BOUNDS = re.compile(r"[\W\d_]+|(?<=[a-z])(?=[A-Z])")  # between the words of a name
+_BOUNDS = re.compile(r"[\W\d_]+|(?<=[a-z])(?=[A-Z])")  # separates the words in a name
 _CAMERA_PREFIX = "observation.images."
-SIGNALS_FOLDER = "reward_signals"  # folder of labels in a dataset's folder
+SIGNALS_FOLDER = "reward_signals"  # label folder inside a dataset's folder
 SeveralTasks: TypeAlias = Literal["each", "first"]
 
 
 def word_of_no_colours(camera: str) -> str | None:
-    """Return the first word in a camera name that means pictures without colours; None without such a word.
+    """Return the first word in a camera name that indicates a picture without colours, or None.
 
     ``depth`` in ``agentview_depth``, ``seg`` in ``seg_instance_id``. Only whole words count: ``segway`` is a camera.
     """
@@ -41,14 +41,14 @@ def word_of_no_colours(camera: str) -> str | None:
 
 
 def camera_named(name: str, cameras: Sequence[str]) -> str | None:
-    """Return the camera of this name, which may omit LeRobot's ``observation.images.``; None: there is none."""
+    """Return the camera with this name, which may omit LeRobot's ``observation.images.``; None: there is none."""
     return next((known for known in cameras if known in (name, _CAMERA_PREFIX + name)), None)
 
 
 def parsed_by_camera(option: str, texts: Iterable[str]) -> dict[str, Any]:
-    """Parse values of an option of corrections, such as ``rotate180``, or ``agentview_rgb=rotate180`` for one camera.
+    """Parse correction values, such as ``rotate180``, or ``agentview_rgb=rotate180`` for one camera.
 
-    The name of a value for all other cameras is empty. Raises ConfigError.
+    The key "" holds the value for all other cameras. Raises ConfigError.
     """
     found: dict[str, Any] = {}
     for text in texts:
@@ -63,7 +63,7 @@ def parsed_by_camera(option: str, texts: Iterable[str]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class AskedCorrections:
-    """Corrections that the caller asks for, by camera. The name of a value for all other cameras is empty."""
+    """Corrections that the caller asks for, by camera. The key "" holds the value for all other cameras."""
 
     orient: Mapping[str, Orientation] = field(default_factory=dict)
     channels: Mapping[str, ChannelOrder] = field(default_factory=dict)
@@ -74,7 +74,7 @@ class AskedCorrections:
         orient: Orientation | Mapping[str, Orientation] | None,
         channels: ChannelOrder | Mapping[str, ChannelOrder] | None,
     ) -> AskedCorrections:
-        """Return values for all cameras, or by camera; None: not given. Raises DatasetError for an unknown value."""
+        """Accept a value for all cameras or by camera; None: not given. Raises DatasetError for an unknown value."""
         asked = cls(
             {"": orient} if isinstance(orient, str) else orient or {},
             {"": channels} if isinstance(channels, str) else channels or {},
@@ -94,10 +94,10 @@ class AskedCorrections:
         turns: Mapping[str, Orientation] | None = None,
         orders: Mapping[str, ChannelOrder] | None = None,
     ) -> Mapping[str, Correction]:
-        """Return the correction of each camera whose frames change. Raises DatasetError for an unknown camera.
+        """Return corrections by camera, for cameras whose frames change. Raises DatasetError for an unknown camera.
 
-        turns: orientations of cameras for which the caller gives none
-        orders: orders of colours of cameras for which the caller gives none
+        turns: default orientations, unless the caller gives one
+        orders: default channel orders, unless the caller gives one
         """
         orient = {**({} if "" in self.orient else turns or {}), **_known("orient", self.orient, cameras)}
         channels = {
@@ -109,7 +109,7 @@ class AskedCorrections:
 
 
 def _known(option: str, asked: Mapping[str, Any], cameras: Sequence[str]) -> dict[str, Any]:
-    """Return the value of each camera for which one is asked. Raises DatasetError for an unknown camera."""
+    """Return the requested values by camera. Raises DatasetError for an unknown camera."""
     found = dict.fromkeys(cameras, asked[""]) if "" in asked else {}
     for name, value in asked.items():
         camera = camera_named(name, cameras)
@@ -122,13 +122,13 @@ def _known(option: str, asked: Mapping[str, Any], cameras: Sequence[str]) -> dic
 
 @dataclass(frozen=True)
 class DatasetEpisode:
-    """One episode of a dataset.
+    """One episode in a dataset.
 
-    index: its number in the dataset
-    name: its name in the dataset
-    task: of all frames, or of the first frame
-    first_index: the dataset's number of its first frame; the others follow
-    tasks: the first frame and the task of each stretch of frames with one task; empty: one task for all frames
+    index: number in the dataset
+    name: name in the dataset
+    task: for all frames, or for the first frame
+    first_index: dataset-wide number of the first frame; the others follow
+    tasks: (first frame, task) for each stretch of frames with one task; empty: one task for all frames
     """
 
     index: int
@@ -140,7 +140,7 @@ class DatasetEpisode:
 
     @property
     def stretches(self) -> list[tuple[str, int]]:
-        """Task and number of frames of each stretch of frames with one task, in order."""
+        """Task and frame count for each stretch with one task, in order."""
         tasks = self.tasks or ((0, self.task),)
         ends = [*(first for first, _ in tasks[1:]), self.num_frames]
         return [(task, end - first) for (first, task), end in zip(tasks, ends, strict=True)]
@@ -150,11 +150,11 @@ class DatasetEpisode:
 class TaskOverride:
     """The caller's task for episodes. Raises DatasetError for a blank text, or an override without a text.
 
-    text: task of episodes without their own; None: not given
-    overrides: True: ``text`` is the task of all episodes
-    several: of an episode with several tasks: ``each``: each frame has its own; ``first``: all have the first frame's
-    column: column of a LeRobot dataset's rows, or feature of an RLDS dataset, that names the tasks; None: the usual one
-    is_needed: False: an episode without a task has an empty one, and is no error
+    text: task for episodes without their own; None: not given
+    overrides: True: use ``text`` for all episodes
+    several: if an episode has several tasks: ``each``: frames keep their own; ``first``: all get the first frame's
+    column: the column in a LeRobot dataset, or feature in an RLDS dataset, that names the tasks; None: the usual one
+    is_needed: False: a missing task is empty, not an error
     """
 
     text: str | None = None
@@ -173,7 +173,7 @@ class TaskOverride:
         require("task_column", is_read, "none with --override-task, which reads no tasks", self.column)
 
     def of(self, where: object, own: object) -> str:
-        """Return the task of an episode; ``own`` is its own. Raises DatasetError without a task."""
+        """Choose between the episode's task, ``own``, and the caller's. Raises DatasetError without a task."""
         if self.text is not None and (self.overrides or is_blank(own)):
             return self.text
         if isinstance(own, str) and not (self.is_needed and is_blank(own)):
@@ -187,7 +187,7 @@ class TaskOverride:
         raise MissingTaskError.at(where, "a task as a sentence", f'{got}: add --task "SENTENCE"')
 
     def check_used(self, episodes: Sequence[DatasetEpisode]) -> None:
-        """Raise UnusedTaskError if the text is given, but is no episode's task."""
+        """Raise UnusedTaskError if a text is given but no episode uses it."""
         is_used = self.text is None or any(task == self.text for episode in episodes for task, _ in episode.stretches)
         if not is_used:
             got = f"{self.text!r}: leave it out, or put it in the place of theirs with --override-task"
@@ -199,16 +199,16 @@ class Dataset(ABC):
 
     kind: layout, for example ``LeRobot v3.0``
     root: default folder for labels
-    label_prefix: beginning of the names of its label files, if its folder may hold other datasets
-    source: id on the Hub, or name of the folder or file
+    label_prefix: starts the label file names if the folder may hold other datasets
+    source: Hub id, or folder or file name
     revision: commit on the Hub; None: local
     cameras: names, in the dataset's order
-    depth_cameras: cameras that the dataset marks as those of distances, used only if named
+    depth_cameras: cameras that the dataset marks as depth, used only if named
     left_out: pictures that cannot be scored, with the reason; not in ``cameras``
-    numbers: of all episodes, in order
-    filter_keys: numbers of the episodes of each filter key or split, such as ``train``
+    numbers: all episode numbers, in order
+    filter_keys: episode numbers by filter key or split, such as ``train``
     given_task: the caller's task
-    corrections: how ``frames`` makes stored frames upright RGB, by camera; others are left as stored
+    corrections: how ``frames`` makes stored frames upright RGB, by camera; other cameras stay as stored
     notes: lines for the caller to read before scoring
     """
 
@@ -228,19 +228,19 @@ class Dataset(ABC):
 
     @cached_property
     def episodes(self) -> Sequence[DatasetEpisode]:
-        """All episodes, by index. Raises DatasetError, which tells the faults of all."""
+        """All episodes, by index. Raises DatasetError with every episode's faults."""
         episodes = self.read(self.numbers)
         self.given_task.check_used(episodes)
         return episodes
 
     def episode(self, number: int) -> DatasetEpisode:
-        """Return one of the episodes in ``numbers``. Only the first call reads it. Raises DatasetError."""
+        """Return the episode with this number, from ``numbers``; cached after the first call. Raises DatasetError."""
         if number not in self._read:
             self._read[number] = self.read_episode(number)
         return self._read[number]
 
     def read(self, numbers: Sequence[int]) -> list[DatasetEpisode]:
-        """Return these of the episodes. Raises FaultsError."""
+        """Return the episodes with these numbers. Raises FaultsError."""
         episodes, faults = [], {}
         for number in numbers:
             try:
@@ -257,19 +257,19 @@ class Dataset(ABC):
 
     @abstractmethod
     def read_episode(self, number: int) -> DatasetEpisode:
-        """Read and check the tables of an episode. A fault of another episode is no error. Raises DatasetError."""
+        """Read and check an episode's tables. Faults in other episodes do not matter. Raises DatasetError."""
 
     def cameras_in(self, numbers: Sequence[int]) -> tuple[Sequence[str], Mapping[str, str]]:
-        """Return ``cameras`` and ``left_out`` of these episodes alone. Raises DatasetError if they share no camera."""
+        """Return ``cameras`` and ``left_out`` for these episodes only. Raises DatasetError if they share no camera."""
         return self.cameras, self.left_out
 
     def chosen_cameras(self, names: Iterable[str] = (), numbers: Sequence[int] | None = None) -> tuple[str, ...]:
-        """Return the cameras of these names; without names, all but those in ``unused_cameras``.
+        """Return the named cameras; without names, all but those in ``unused_cameras``.
 
         numbers: episodes that need the cameras; None: all
 
-        A name may omit LeRobot's ``observation.images.``. Raises DatasetError for an unknown camera, or if none is
-        named and none is used without.
+        A name may omit LeRobot's ``observation.images.``. Raises DatasetError for an unknown camera, or if no camera is
+        named and all are in ``unused_cameras``.
         """
         cameras, left_out = self.cameras_in(self.numbers if numbers is None else numbers)
         some = f"some of {', '.join(cameras)}"
@@ -287,9 +287,9 @@ class Dataset(ABC):
         return tuple(chosen)
 
     def unused_cameras(self, cameras: Sequence[str]) -> Mapping[str, str]:
-        """Return which of these cameras are used only if named, and what they show instead of colours, as ``depth``.
+        """Return which cameras are used only if named, and what they show instead of colours, such as ``depth``.
 
-        The dataset marks a depth camera, or a word in the name of the camera says so.
+        Either the dataset marks a depth camera, or a word in the camera's name says so.
         """
         named = {camera: word for camera in cameras if (word := word_of_no_colours(camera))}
         return named | {camera: "depth" for camera in cameras if camera in self.depth_cameras}
@@ -302,20 +302,20 @@ class Dataset(ABC):
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
         """Return a text that identifies the episode's stored frames. Raises DatasetError.
 
-        For a video, its size and modification time, or its SHA-256 with ``verify``. For pictures in a table, their
-        digest, because other programs write into tables too.
+        For a video: size and modification time, or SHA-256 with ``verify``. For pictures in a table: their digest,
+        because other programs also write tables.
         """
 
     @abstractmethod
     def check(self, episode: DatasetEpisode, camera: str) -> None:
-        """Find every frame of the episode without decoding. Raises DatasetError for missing or contradictory data."""
+        """Find every frame in the episode without decoding. Raises DatasetError for missing or contradictory data."""
 
     @abstractmethod
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         """Yield the T frames in order, uint8 [H, W, 3], as stored, each decoded once. Raises DatasetError."""
 
     def frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        """Yield the T frames in order, uint8 [H, W, 3], upright RGB by ``corrections``. Raises DatasetError."""
+        """Yield the T frames in order, uint8 [H, W, 3], corrected to upright RGB. Raises DatasetError."""
         correction = self.corrections.get(camera, Correction())
         return (correction.applied(frame) for frame in self.stored_frames(episode, camera))
 
@@ -323,7 +323,7 @@ class Dataset(ABC):
 def iter_episodes(
     dataset: Dataset, cameras: Sequence[str] | None = None
 ) -> Iterator[tuple[DatasetEpisode, Mapping[str, Trajectory]]]:
-    """Yield each episode with its trajectory from each camera. Raises DatasetError.
+    """Yield each episode with a trajectory per camera. Raises DatasetError.
 
     cameras: some of the dataset's; None: as ``Dataset.chosen_cameras`` without names
 

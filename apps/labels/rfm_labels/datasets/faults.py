@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Errors of a dataset, and the lines that tell the faults of many episodes with the options that help."""
+"""Dataset errors, and messages that list the faults in many episodes with the options that help."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MOST_SHOWN = 20
 
 
 def listed(numbers: Iterable[int]) -> str:
-    """Return sorted numbers in the form of ``--episodes``: ``0:17,18,20:40``."""
+    """Format sorted numbers for ``--episodes``: ``0:17,18,20:40``."""
     runs: list[list[int]] = []
     for number in numbers:
         if runs and number == runs[-1][1]:
@@ -27,17 +27,17 @@ def listed(numbers: Iterable[int]) -> str:
 
 
 def shortened(lines: Sequence[str]) -> list[str]:
-    """Return the first lines, and a line with the number of the others."""
+    """Return the first lines, and a line that counts the rest."""
     more = len(lines) - _MOST_SHOWN
     return [*lines[:_MOST_SHOWN], *([f"... and {more} more"] if more > 0 else [])]
 
 
 class DatasetError(RewardError, InvalidValueError):
-    """A contradictory or unreadable dataset. where: a file, or a place in it"""
+    """A contradictory or unreadable dataset. where: a file, or a place in it."""
 
 
 def unreadable(file: Path, expected: str, error: object) -> DatasetError:
-    """Return the error of a file that a library cannot read; its ``error`` names no Git LFS."""
+    """Return the error for a file that a library cannot read; the library's ``error`` does not mention Git LFS."""
     with suppress(OSError):
         error = (git_lfs_pointer(file) if file.is_file() else "") or error
     return DatasetError.at(file, expected, error)
@@ -48,11 +48,11 @@ class MissingTaskError(DatasetError):
 
 
 class UnusedTaskError(DatasetError):
-    """A task of the caller that no episode needs."""
+    """A task from the caller that no episode needs."""
 
 
 class FaultsError(DatasetError):
-    """Several faults, one per line, then the options that help. lines: of the message"""
+    """Several faults, one per line, then the options that help. lines: the message's lines."""
 
     lines: tuple[str, ...] = ()
 
@@ -65,9 +65,9 @@ class FaultsError(DatasetError):
 
     @classmethod
     def of(cls, faults: Mapping[int, RewardError], numbers: Sequence[int]) -> FaultsError:
-        """Return the error of these episodes: a line for each distinct fault, then the options that help.
+        """Return the error for these episodes: a line for each distinct fault, then the options that help.
 
-        numbers: of all chosen episodes
+        numbers: all chosen episodes
         """
         alike: dict[str, list[int]] = {}
         for number, fault in faults.items():

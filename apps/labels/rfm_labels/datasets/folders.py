@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""A folder with a video, a file of arrays, a folder of pictures (2.png before 10.png) or a recording for each episode.
+"""A folder with one video, array file, picture folder (2.png before 10.png) or recording per episode.
 
-A table of tasks (``opening``) orders the episodes. Without a table, the caller names the task, and the order is that of
-the names, with 2 before 10. Videos need PyAV, pictures Pillow.
+A table of tasks (see ``opening``) orders the episodes. Without a table, the caller names the task, and episodes sort by
+name, with 2 before 10. Videos need PyAV, pictures Pillow.
 
-The numbers in file names order the pictures of an episode: counts or times (``-1``, ``0.25``, ``2e-05``). In a pattern
-of names, ``*`` stands for a number: ``*_color_0.jpg``.
+The numbers in file names order an episode's pictures: counts or times (``-1``, ``0.25``, ``2e-05``). In a file name
+pattern, ``*`` stands for a number: ``*_color_0.jpg``.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisod
 from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.datasets.stored_files import Span, digest_of, faults_at, file_identity, turn_mark
 
-_NOT_IN_A_WORD = r"(?<![^\W_])"  # behind a letter or a digit, - and . separate: frame-1.png, frame.1.png, 2026-11-26
+_NOT_IN_A_WORD = r"(?<![^\W_])"  # after a letter or digit, - and . are separators: frame-1.png, frame.1.png, 2026-11-26
 _NUMBER = re.compile(
     rf"((?:{_NOT_IN_A_WORD}-)?"
     rf"(?:(?<!\d\.)\d+\.\d+(?!\.?\d)|{_NOT_IN_A_WORD}\.\d+|\d+)"  # 1.2.10 has no decimals
     r"(?:[eE][+-]\d+(?![^\W_]))?)"
 )
-_LETTERS = 2  # minimum letters of a word before a camera number; a time may hold one letter, as in 20261126T123000
+_LETTERS = 2  # minimum word length before a camera number; a time may contain one letter, as in 20261126T123000
 _EXAMPLES = 3  # kinds of names in a message
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _FILES_AT_A_TIME = 4
@@ -43,19 +43,19 @@ _UNITREE_FILE, _UNITREE_FOLDER = "data.json", "colors"
 
 
 def is_pattern(path: Path) -> bool:
-    """True if the last part of a path is a pattern of file names."""
+    """True if the last path component is a file name pattern."""
     return "*" in path.name
 
 
 def matching(pattern: str, files: Sequence[str]) -> list[str]:
-    """Return the file names that a pattern stands for."""
+    """Return the file names that match a pattern."""
     name = re.compile(_NUMBER.pattern.join(map(re.escape, pattern.split("*"))))
     return list(filter(name.fullmatch, files))
 
 
 @dataclass(frozen=True)
 class _Name:
-    """A file name split into text and numbers. words: the texts, one more than numbers, and the format"""
+    """A file name split into text and numbers. words: the texts around the numbers, then the format."""
 
     file: str
     words: tuple[str, ...]
@@ -77,9 +77,9 @@ class _Name:
 
 
 def in_order_of_numbers(folder: Path, files: Sequence[str]) -> list[str]:
-    """Return an episode's file names in order.
+    """Sort an episode's file names by their numbers.
 
-    Raises DatasetError for several kinds of names, such as those of several cameras, or for a repeated number.
+    Raises DatasetError for a repeated number, or different kinds of names, such as from several cameras.
     """
     names = sorted(map(_Name.of, files), key=lambda name: (name.numbers, name.file))
     if len({name.words for name in names}) > 1:
@@ -96,10 +96,10 @@ def in_order_of_numbers(folder: Path, files: Sequence[str]) -> list[str]:
 
 
 def _num_cameras(names: Sequence[_Name], place: int) -> int:
-    """Number of cameras that the numbers at a place count; 0 if they count frames.
+    """How many cameras the numbers at a place count; 0 if they count frames.
 
-    Cameras have the same frames, so names repeat without a camera number. Times such as ``12_500`` (s, ms) may repeat
-    by chance, so either all names must repeat, or the number must belong to a word, as in ``cam1_0001``.
+    All cameras have the same frames, so names repeat once the camera number is removed. Times such as ``12_500`` (s,
+    ms) may repeat by chance, so either all names must repeat, or the number must belong to a word, as in ``cam1_0001``.
     """
     others = Counter(name.numbers[:place] + name.numbers[place + 1 :] for name in names)
     values = {name.numbers[place] for name in names}
@@ -123,11 +123,11 @@ def _several_kinds(folder: Path, names: Sequence[_Name], place: int | None) -> D
 
 @dataclass(frozen=True)
 class Contents:
-    """The episodes of a folder, and what the caller says of them.
+    """The episodes in a folder, and what the caller says about them.
 
     root: folder to which the names are relative
-    tasks: each episode's task by its path; None: no task
-    table: file of the tasks, or the folder, for messages
+    tasks: task by episode path; None: no task
+    table: task table, or the folder, for messages
     """
 
     root: Path
@@ -138,7 +138,7 @@ class Contents:
 
 
 class EpisodeFiles(Dataset):
-    """Episodes in files or folders of their own."""
+    """Episodes that are separate files or folders."""
 
     def __init__(self, contents: Contents) -> None:
         self.root = contents.root
@@ -151,7 +151,7 @@ class EpisodeFiles(Dataset):
         self._firsts = [0]
 
     def read_episode(self, number: int) -> DatasetEpisode:
-        """Read an episode, and count the frames before it; a broken one before it has none. Raises DatasetError."""
+        """Read an episode, and count the frames before it; broken episodes count as empty. Raises DatasetError."""
         name = self._names[number]
         own = self._contents.tasks[name] or self.own_task(self.root / name)
         task = self.given_task.of(f"{self._contents.table}: {name}", own)
@@ -174,17 +174,17 @@ class EpisodeFiles(Dataset):
 
     @abstractmethod
     def length(self, file: Path) -> int:
-        """Return the number of frames of an episode. Raises DatasetError."""
+        """Return an episode's frame count. Raises DatasetError."""
 
     def own_task(self, file: Path) -> str | None:
-        """Return the task that an episode's file holds; None: it holds no task. Raises DatasetError."""
+        """Return the task stored in an episode's file, or None. Raises DatasetError."""
         return None
 
 
 def in_natural_order(names: Iterable[str]) -> list[str]:
-    """Return names of episodes, sorted with their numbers as integers: ``2`` before ``10``, ``1.2`` before ``1.10``.
+    """Sort episode names, comparing numbers as integers: ``2`` before ``10``, ``1.2`` before ``1.10``.
 
-    ``in_order_of_numbers`` orders frames, whose numbers may be times.
+    ``in_order_of_numbers`` sorts frames, whose numbers may be times.
     """
 
     def key(name: str) -> tuple[list[tuple[int, str]], str]:
@@ -195,7 +195,7 @@ def in_natural_order(names: Iterable[str]) -> list[str]:
 
 
 class VideoFolder(EpisodeFiles):
-    """Episodes in videos, each in a file of its own."""
+    """Episodes stored as one video file each."""
 
     kind = "videos"
     cameras = ("video",)
@@ -233,7 +233,7 @@ class VideoFolder(EpisodeFiles):
 
 
 class ArrayFiles(EpisodeFiles):
-    """Episodes in files of arrays. A ``.npz`` file may hold its task."""
+    """Episodes stored as array files. A ``.npz`` file may hold the task."""
 
     kind = "arrays"
     cameras = ("frames",)
@@ -264,7 +264,7 @@ class ArrayFiles(EpisodeFiles):
 
 
 def _facts(file: Path) -> tuple[int, str | None]:
-    """The number of frames, and the task. The file is read whole: only all its values tell if they are frames."""
+    """The frame count and the task. Reads the whole file: only the complete values show whether they are frames."""
     trajectory = _read(file)
     return trajectory.num_frames, trajectory.task or None
 
@@ -276,7 +276,7 @@ def _frames(file: Path) -> UInt8Array:
 
 
 def _read(file: Path) -> Trajectory:
-    """The frames and the task in a file. Raises DatasetError, also for embeddings."""
+    """Read the frames and the task from a file. Raises DatasetError, also for embeddings."""
     try:
         trajectory = load_trajectory(file)
     except InvalidSampleError as error:
@@ -287,7 +287,7 @@ def _read(file: Path) -> Trajectory:
 
 
 class FrameFolders(EpisodeFiles):
-    """Episodes in folders of pictures, or in some files of a folder (``is_pattern``)."""
+    """Episodes stored as picture folders, or as matching files in a folder (``is_pattern``)."""
 
     kind = "folders of frames"
     cameras: Sequence[str] = ("frames",)
@@ -296,7 +296,7 @@ class FrameFolders(EpisodeFiles):
         return len(self.files(file, self.cameras[0]))
 
     def files(self, place: Path, camera: str) -> Sequence[Path]:
-        """Return the frames of an episode, in order. Raises DatasetError."""
+        """Return an episode's frames, in order. Raises DatasetError."""
         return _pictures_in(place)
 
     def decoder(self, camera: str) -> str | None:
@@ -325,12 +325,12 @@ class FrameFolders(EpisodeFiles):
 
 
 def is_of_unitree(folder: Path) -> bool:
-    """True for an episode of Unitree's xr_teleoperate."""
+    """True for an episode from Unitree's xr_teleoperate."""
     return (folder / _UNITREE_FILE).is_file() and (folder / _UNITREE_FOLDER).is_dir()
 
 
 class UnitreeFolders(FrameFolders):
-    """Episodes of Unitree's xr_teleoperate: ``data.json`` names the task, and a picture of each camera by frame."""
+    """Episodes from Unitree's xr_teleoperate: ``data.json`` has the task and, per frame, a picture per camera."""
 
     kind = "Unitree"
 
@@ -353,7 +353,7 @@ class UnitreeFolders(FrameFolders):
 
 
 def _recording(folder: Path) -> tuple[str | None, Mapping[str, Sequence[Path]]]:
-    """The task and each camera's pictures. Raises DatasetError, also for a frame without one of the cameras."""
+    """The task and each camera's pictures. Raises DatasetError, also if a frame lacks one of the cameras."""
     file = folder / _UNITREE_FILE
     try:
         told = json.loads(file.read_bytes())
@@ -367,14 +367,14 @@ def _recording(folder: Path) -> tuple[str | None, Mapping[str, Sequence[Path]]]:
 
 
 def is_picture(file: Path) -> bool:
-    """True for a PNG or JPEG file, by its name; False for a hidden one."""
+    """True for a PNG or JPEG file, by suffix; False for a hidden one."""
     return file.suffix.lower() in PICTURE_SUFFIXES and not file.name.startswith(".") and file.is_file()
 
 
 def _pictures_in(place: Path) -> list[Path]:
-    """The frames of an episode, in order. Raises DatasetError without frames, or for frames of several kinds.
+    """List an episode's frames in order. Raises DatasetError if there are none, or several kinds.
 
-    place: a folder, or a pattern of file names in it
+    place: a folder, or a pattern for file names in it
     """
     folder = place.parent if is_pattern(place) else place
     try:

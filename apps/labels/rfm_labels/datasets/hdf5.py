@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""HDF5 files of robomimic and LIBERO (``data/demo_<i>/obs/<camera>``), of IsaacLab-Arena, ALOHA, RoboTwin and others.
+"""HDF5 files from robomimic and LIBERO (``data/demo_<i>/obs/<camera>``), IsaacLab-Arena, ALOHA, RoboTwin and others.
 
-Needs ``rfm-labels[hdf5]``. An episode's name is ``demo_<i>`` in all layouts.
+Needs ``rfm-labels[hdf5]``. Episodes are named ``demo_<i>`` in all layouts.
 
-In a file of robomimic or LIBERO the task is the demonstration's own (``ep_meta``), else LIBERO's sentence
-(``problem_info`` of ``data``), robomimic's (``env_args``), or the caller's. LIBERO stores its pictures upside down:
-they are turned, unless the caller says otherwise. robomimic's filter keys (``mask/train``) name some demonstrations.
+In robomimic and LIBERO files the task is the demonstration's own (``ep_meta``), else LIBERO's sentence
+(``problem_info`` of ``data``), robomimic's (``env_args``), or the caller's. LIBERO stores pictures upside down: they
+are turned, unless the caller says otherwise. robomimic's filter keys (``mask/train``) name some demonstrations.
 """
 
 from __future__ import annotations
@@ -57,20 +57,20 @@ _ACTIONS = "actions"
 
 
 def is_hdf5(path: Path) -> bool:
-    """True for an existing file with the suffix of HDF5."""
+    """True for an existing file with an HDF5 suffix."""
     return path.suffix.lower() in SUFFIXES and path.is_file()
 
 
 def label_prefix(path: Path) -> str:
-    """Return the beginning of the names of a dataset's label files: ``demos.`` for ``demos.hdf5``, else nothing."""
+    """Return the prefix for a dataset's label file names: ``demos.`` for ``demos.hdf5``, else nothing."""
     return f"{path.stem}." if path.suffix.lower() in SUFFIXES else ""
 
 
 class Hdf5Dataset(Dataset):
-    """The demonstrations of one file.
+    """The demonstrations in one file.
 
     task: task from the caller
-    corrections: corrections from the caller; without an orientation, cameras of LIBERO files are turned
+    corrections: corrections from the caller; without an orientation, LIBERO cameras are turned
     """
 
     kind = "HDF5"
@@ -106,7 +106,7 @@ class Hdf5Dataset(Dataset):
             is_libero = self._layout is ROBOMIMIC and is_of_libero(attributes)
             self.fps = self._layout.fps or fps_of(attributes)
             self._firsts = first_files(demos, self._pictures, self._layout.are_pictures)
-            is_upright = "opencv" in str(attribute(attributes, "macros_image_convention"))  # robosuite then does
+            is_upright = "opencv" in str(attribute(attributes, "macros_image_convention"))  # robosuite turned frames
         self.kind = "HDF5" if self._layout is ROBOMIMIC else f"HDF5 ({self._layout.name})"
         self.numbers = list(demos)
         known = [camera for camera in self._pictures if any(camera in self._cameras_of(each) for each in self.numbers)]
@@ -124,7 +124,7 @@ class Hdf5Dataset(Dataset):
         return own_task_of(demo) or task_of(attributes) if self._layout.is_in_data else task_in(self.file, opened, demo)
 
     def _lengths_of(self, demo: Any, cameras: Sequence[str]) -> Mapping[str, int]:
-        """Number of frames of each camera, and of actions, if present."""
+        """Frame count per camera, and action count if present."""
         skipped = self._layout.skipped
         lengths = {f"obs/{camera}": len(demo["obs"][camera]) - skipped for camera in cameras}
         shape = getattr(demo.get(_ACTIONS), "shape", None) if lengths else None
@@ -145,7 +145,7 @@ class Hdf5Dataset(Dataset):
         return notes
 
     def _notes_on_colours(self, asked: AskedCorrections, unmarked: Sequence[str]) -> list[str]:
-        """A line on red and blue of the cameras for which the caller gives no order."""
+        """A note on red and blue, for cameras without a channel order from the caller."""
         untold = [camera for camera in self._firsts if {"", camera}.isdisjoint(asked.channels)]
         swapped = [camera for camera in untold if camera in unmarked]
         if swapped:
@@ -187,7 +187,7 @@ class Hdf5Dataset(Dataset):
         raise faults[numbers[0]] if whole else FaultsError.of(faults, numbers)
 
     def _shared(self, numbers: Sequence[int]) -> tuple[Sequence[str], Mapping[str, str]]:
-        """The cameras of these demonstrations, and the faults of other pictures."""
+        """The cameras that all these demonstrations share, and what is wrong with other pictures."""
         told = {name: [faults[number] for number in numbers] for name, faults in self._pictures.items()}
         faults = {name: next(filter(None, of_demos), "") for name, of_demos in told.items()}
         cameras = tuple(name for name, fault in faults.items() if not fault)
@@ -244,9 +244,9 @@ class Hdf5Dataset(Dataset):
 
 
 def _one_length(lengths: Mapping[str, int]) -> int:
-    """Number of frames in all cameras; 0 if the cameras differ or have none.
+    """The frame count, equal in all cameras; 0 if cameras differ or there are none.
 
-    The number of actions is the same, or one less if the last observation has no action.
+    The action count must be the same, or one less if the last observation has no action; otherwise 0.
     """
     of_cameras = {length for key, length in lengths.items() if key != _ACTIONS}
     length = of_cameras.pop() if len(of_cameras) == 1 else 0

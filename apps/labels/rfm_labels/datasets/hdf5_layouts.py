@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Layouts of HDF5 files: where an episode has its pictures, actions and task. Needs h5py.
+"""HDF5 layouts: where an episode keeps pictures, actions and task. Needs h5py.
 
-An episode of every layout looks the same to the reader: ``{"obs": {camera: array}, "actions": array}`` with ``attrs``.
+Episodes look the same to the reader in every layout: ``{"obs": {camera: array}, "actions": array}`` with ``attrs``.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ import numpy as np
 from rfm_client.options import first_names
 from rfm_labels.datasets.faults import DatasetError, require, unreadable
 
-DOCUMENTS = ("problem_info", "env_args")  # attributes of ``data`` with a JSON object
+DOCUMENTS = ("problem_info", "env_args")  # attributes of ``data`` that hold a JSON object
 _DEMO = re.compile(r"demo_(\d+)")
-_SENTENCES = ("language_instruction", "language", "lang")  # keys of the task in problem_info and env_args
+_SENTENCES = ("language_instruction", "language", "lang")  # keys for the task in problem_info and env_args
 _DEFAULT_FPS = 20.0  # robosuite's
 _TRAJECTORY = re.compile(r"traj_(\d+)")
-_TASK_NAMES = ("language_instruction", "instruction", "task", "language_raw")  # of datasets, and of attributes
+_TASK_NAMES = ("language_instruction", "instruction", "task", "language_raw")  # names of datasets and attributes
 
 
 @contextmanager
@@ -34,7 +34,7 @@ def opened_hdf5(file: Path) -> Iterator[Any]:
         import h5py
     except ImportError as error:
         raise ImportError('HDF5 files need h5py: pip install ./client "./apps/labels[hdf5]"') from error
-    if file.exists() and not file.is_file():  # opening a pipe would wait for ever
+    if file.exists() and not file.is_file():  # opening a pipe would block for ever
         raise DatasetError.at(file, "an HDF5 file", "a folder, a pipe, a socket or a device")
     try:
         opened = h5py.File(file, "r")
@@ -46,14 +46,14 @@ def opened_hdf5(file: Path) -> Iterator[Any]:
     with opened:
         try:
             yield opened
-        except (OSError, RuntimeError, KeyError) as error:  # h5py's, of damaged data
+        except (OSError, RuntimeError, KeyError) as error:  # h5py raises these for damaged data
             raise DatasetError.at(file, "an undamaged HDF5 file", error) from error
 
 
 def demonstrations(file: Path, opened: Any) -> dict[int, tuple[str, Any]]:
-    """Return the names and groups of demonstrations by number; None for a group that cannot be opened.
+    """Return demonstration names and groups by number; None for a group that cannot be opened.
 
-    Raises DatasetError for no demonstration, or two demonstrations with one number.
+    Raises DatasetError if there is no demonstration, or two share a number.
     """
     group = opened.get("data")
     members = members_of(group)
@@ -76,9 +76,9 @@ def members_of(group: Any) -> Mapping[str, Any]:
 
 
 def filter_keys(opened: Any, names: Mapping[int, str]) -> tuple[Mapping[str, Sequence[int]], Sequence[str]]:
-    """Return the demonstration numbers in each dataset of ``mask``, and a note on each dataset with other contents.
+    """Return the demonstration numbers in each ``mask`` dataset, and a note on each dataset with other contents.
 
-    names: names of the demonstrations by number
+    names: demonstration names by number
     """
     group, numbers = opened.get("mask"), {name: number for number, name in names.items()}
     found: dict[str, Sequence[int]] = {}
@@ -97,7 +97,7 @@ def filter_keys(opened: Any, names: Mapping[int, str]) -> tuple[Mapping[str, Seq
 
 
 def unread(opened: Any, names: Iterable[str]) -> list[str]:
-    """Return a line that lists all unread groups; empty if there are none. names: demonstrations"""
+    """Return a line that lists all unread groups; empty if there are none. names: demonstrations."""
     read = set(names)
     others = [f"data/{name}" for name in members_of(opened["data"]) if name not in read]
     others += [name for name in members_of(opened) if name not in ("data", "mask")]
@@ -105,7 +105,7 @@ def unread(opened: Any, names: Iterable[str]) -> list[str]:
 
 
 def texts_in(stored: Any) -> list[str] | None:
-    """Return the texts in a dataset; None if it holds something else or cannot be read."""
+    """Read the texts in a dataset; None if it holds something else or cannot be read."""
     if getattr(stored, "shape", None) is None:
         return None
     try:
@@ -122,7 +122,7 @@ def _missing_number(name: str, names: Mapping[int, str]) -> int | None:
 
 
 def own_task_of(demo: Any) -> Any:
-    """Return the task in a demonstration's ``ep_meta``, as robomimic reads it, or in an attribute; None without one."""
+    """Read a demonstration's task from ``ep_meta``, as robomimic does, or from an attribute; None without one."""
     attributes = getattr(demo, "attrs", {})
     stored = document(attributes, "ep_meta")
     own = next((stored[key] for key in _SENTENCES if stored.get(key)), None)
@@ -130,13 +130,13 @@ def own_task_of(demo: Any) -> Any:
 
 
 def task_of(attributes: Mapping[str, Any]) -> Any:
-    """Return the task of all demonstrations from the attributes of ``data``; None if there is none."""
+    """Read the task for all demonstrations from the attributes on ``data``; None if there is none."""
     documents = (document(attributes, name) for name in DOCUMENTS)
     return next((found[key] for found in documents for key in _SENTENCES if found.get(key)), None)
 
 
 def is_of_libero(attributes: Mapping[str, Any]) -> bool:
-    """True if the attributes of ``data`` are LIBERO's."""
+    """True if the attributes on ``data`` are LIBERO's."""
     env_names = [attribute(attributes, "env_name"), document(attributes, "env_args").get("env_name")]
     env_names.append(attribute(attributes, "tag"))
     has_problem = not {"problem_name", "language_instruction"}.isdisjoint(document(attributes, "problem_info"))
@@ -145,14 +145,14 @@ def is_of_libero(attributes: Mapping[str, Any]) -> bool:
 
 
 def fps_of(attributes: Mapping[str, Any]) -> float:
-    """Return the frames per second: robosuite's control frequency, else its default."""
+    """Return the frame rate in Hz: robosuite's control frequency, else its default."""
     told = document(attributes, "env_args").get("env_kwargs")
     fps = told.get("control_freq") if isinstance(told, dict) else None
     return float(fps) if isinstance(fps, int | float) and 0 < fps < 1000 else _DEFAULT_FPS
 
 
 def document(attributes: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    """Return the JSON object in an attribute; empty if there is none."""
+    """Parse the JSON object in an attribute; empty if there is none."""
     try:
         found = json.loads(attribute(attributes, name))
     except (ValueError, TypeError, RecursionError):
@@ -161,13 +161,13 @@ def document(attributes: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 
 
 def unread_documents(attributes: Mapping[str, Any]) -> list[str]:
-    """Return the names of attributes that should hold a JSON object but do not."""
+    """Name the attributes that should hold a JSON object but do not."""
     broken = [name for name in DOCUMENTS if name in attributes and not document(attributes, name)]
     return [name for name in broken if str(attribute(attributes, name)).strip() not in ("", "{}")]
 
 
 def attribute(attributes: Mapping[str, Any], name: str) -> Any:
-    """Return an attribute, with bytes as text, an array as a list, and a single element without the list.
+    """Read an attribute: bytes become text, an array becomes a list, a single element stands alone.
 
     Return None for an attribute that is missing, empty or unreadable.
     """
@@ -184,16 +184,16 @@ def attribute(attributes: Mapping[str, Any], name: str) -> Any:
 
 @dataclass(frozen=True)
 class Layout:
-    """The paths in a file of one layout.
+    """The paths in a file with this layout.
 
-    group: of an episode; empty: the file is one episode
-    pictures: of a camera, in the group
-    actions: in the group; empty: not compared with the frames
-    are_pictures: True: whatever is at ``pictures`` is a camera; False: the observations hold other arrays, too
+    group: path to an episode; empty: the file is one episode
+    pictures: path to a camera, within the group
+    actions: path within the group; empty: not compared with the frames
+    are_pictures: True: whatever is at ``pictures`` is a camera; False: the observations also hold other arrays
     fps: the writer's default; None: in the attributes
-    skipped: number of pictures before the first frame
+    skipped: how many pictures come before the first frame
     without_pictures: remedy for a file without pictures
-    colours: note on the order of colours in encoded frames
+    colours: note on the channel order in encoded frames
     """
 
     name: str
@@ -212,11 +212,11 @@ class Layout:
         return self.group == "data/{demo}"
 
     def group_of(self, demo: str) -> str:
-        """Return the path of the group of ``demo_<number>``; empty: the file."""
+        """Return the path to the ``demo_<number>`` group; empty: the file."""
         return self.group.format(demo=demo, number=demo.removeprefix("demo_"))
 
     def path_of(self, demo: str, camera: str) -> str:
-        """Return the path of a camera's frames."""
+        """Return the path to a camera's frames."""
         return f"{self.group_of(demo)}/{self.pictures.format(camera=camera)}".lstrip("/")
 
     def cameras_at(self, demo: str) -> str:
@@ -224,7 +224,7 @@ class Layout:
         return self.path_of(demo, "{camera}").partition("{camera}")[0].rstrip("/")
 
     def episodes(self, file: Path, opened: Any) -> dict[int, tuple[str, Any]]:
-        """Return name and content of each episode by number; None for a group that cannot be opened.
+        """Return each episode's name and content by number; None for a group that cannot be opened.
 
         Raises DatasetError.
         """
@@ -271,7 +271,7 @@ ARENA = Layout(
     "actions",
     are_pictures=False,
     fps=50.0,
-    skipped=1,  # the last render of the episode before; IsaacLab-Arena's converter to LeRobot leaves it out, too
+    skipped=1,  # the previous episode's last render; IsaacLab-Arena's converter to LeRobot also drops it
 )
 
 
@@ -309,7 +309,7 @@ _MANISKILL = Layout(
 
 
 def layout_of(opened: Any) -> Layout:
-    """Return the layout of an open file; robomimic's for an unknown one, whose reader then says what it lacks."""
+    """Detect an open file's layout; robomimic's if unknown, whose reader then says what is missing."""
     for layout in _OTHERS:
         above = members_of(opened.get(layout.pictures.partition("/{camera}")[0]))
         nested = layout is not ROBOTWIN or any(hasattr(each, "keys") and "rgb" in each for each in above.values())
@@ -336,7 +336,7 @@ def task_places(file: Path) -> str:
 
 
 def task_in(file: Path, opened: Any, episode: Any) -> Any:
-    """Return the task of an episode: in attributes, in a dataset, or in RoboTwin's side file; None without one."""
+    """Read an episode's task from attributes, a dataset, or RoboTwin's side file; None without one."""
     found = own_task_of(episode)
     for name in _TASK_NAMES:
         found = found or attribute(getattr(episode, "attrs", {}), name) or _one(texts_in(opened.get(name)))
@@ -344,13 +344,13 @@ def task_in(file: Path, opened: Any, episode: Any) -> Any:
 
 
 def _one(texts: list[str] | None) -> Any:
-    """The only text; all of them if they differ, which no episode can have as its task."""
+    """The only text; all of them if they differ, which no episode accepts as a task."""
     different = list(dict.fromkeys(texts or ()))
     return different[0] if len(different) == 1 else different
 
 
 def instructions_of(file: Path) -> list[str]:
-    """Return the sentences of RoboTwin's side file, those of training first; empty without it. Raises DatasetError."""
+    """Read the sentences in RoboTwin's side file, training ones first; empty without it. Raises DatasetError."""
     side = file.absolute().parent.parent / "instructions" / f"{file.stem}.json"
     if not side.is_file():
         return []

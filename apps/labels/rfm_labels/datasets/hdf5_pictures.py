@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Frames in HDF5 arrays: pixels, or a JPEG or PNG file for each frame. Needs h5py; files need Pillow.
+"""Frames in HDF5 arrays: pixels, or one JPEG or PNG file per frame. Needs h5py; files need Pillow.
 
-A frame's file is a row of bytes padded with zeros, a text of fixed length, or an array of its own length.
+A frame's file is a zero-padded byte row, a fixed-length text, or an array with its own length.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from rfm_labels.datasets.faults import require
 from rfm_labels.datasets.hdf5_layouts import members_of
 from rfm_labels.datasets.stored_files import faults_at
 
-_STARTS = (b"\xff\xd8\xff", b"\x89PNG")  # first bytes of JPEG and PNG
-_RAW_SIZES_PX = ((480, 640), (720, 1280))  # RoboMIND's cameras, some of whose frames are pixels between JPEG files
+_STARTS = (b"\xff\xd8\xff", b"\x89PNG")  # first bytes in JPEG and PNG files
+_RAW_SIZES_PX = ((480, 640), (720, 1280))  # RoboMIND's cameras, which store some frames as pixels between JPEG files
 _RGB_MARK = b"\xff\xfe\x00\x0aXPL-RGB1"  # comment in RoboTwin's JPEG files whose red is red
 
 
 class EncodedFrames:
-    """The frames of one camera, T files. Pixels between the files are read as OpenCV's: blue first.
+    """One camera's frames as T files. Pixels between the files are read as OpenCV stores them: blue first.
 
-    stored: HDF5 dataset of T files
-    where: file and path of the frames, for messages
+    stored: HDF5 dataset with T files
+    where: file and path, for messages
     """
 
     def __init__(self, stored: Any, where: str) -> None:
@@ -36,12 +36,12 @@ class EncodedFrames:
         self._where = where
 
     def files(self) -> Iterator[bytes]:
-        """Yield the T files, without padding behind a text of fixed length."""
+        """Yield the T files. Padding after fixed-length text is dropped."""
         for t in range(len(self._stored)):
             yield np.asarray(self._stored[t]).tobytes()
 
     def check(self) -> None:
-        """Raise DatasetError for a frame that is no picture by its header."""
+        """Raise DatasetError if a frame's header is not a picture's."""
         marked = []
         for t, file in enumerate(self.files()):
             if self._raw_size(file) is None:
@@ -53,7 +53,7 @@ class EncodedFrames:
         require(self._where, len(set(marked)) < 2, "JPEG files all with RoboTwin's mark of RGB, or all without", got)
 
     def pixels(self) -> Iterator[UInt8Array]:
-        """Yield the T frames, uint8 [H, W, 3]. Raises DatasetError with the frame."""
+        """Yield the T frames, uint8 [H, W, 3]. Raises DatasetError with the frame number."""
         shape: tuple[int, ...] = ()
         for t, file in enumerate(self.files()):
             size = self._raw_size(file)
@@ -70,21 +70,21 @@ class EncodedFrames:
             yield frame
 
     def _require_end(self, t: int, file: bytes) -> None:
-        """Raise DatasetError for a JPEG file that is cut off. Pillow takes the zeros behind it for pixels."""
+        """Raise DatasetError for a truncated JPEG file. Pillow would decode the zeros behind it as pixels."""
         is_whole = not file.startswith(_STARTS[0]) or file.rfind(b"\xff\xd9") > file.rfind(b"\xff\xda")
         require(
             self._at(t), is_whole, "a whole JPEG file", "one without an end: leave the episode out, or write it again"
         )
 
     def _raw_size(self, file: bytes) -> tuple[int, int] | None:
-        """Height and width of a frame stored as pixels; None: it is a file."""
+        """Height and width if a frame is stored as pixels; None: it is a file."""
         if file.startswith(_STARTS):
             return None
         return next((size for size in self._sizes if len(file) == size[0] * size[1] * 3), None)
 
     @cached_property
     def _sizes(self) -> tuple[tuple[int, int], ...]:
-        """The size of the first readable picture; RoboMIND's sizes if all frames are pixels."""
+        """The first readable picture's size; RoboMIND's sizes if all frames are pixels."""
         for t, file in enumerate(self.files()):
             if file.startswith(_STARTS):
                 with faults_at(self._at(t)):
@@ -101,25 +101,25 @@ def _size(shape: tuple[int, ...]) -> str:
 
 
 def has_rgb_mark(file: bytes) -> bool:
-    """True if a JPEG file of RoboTwin says that its colours are RGB; those before September 2026 are BGR."""
+    """True if a RoboTwin JPEG file is marked as RGB; files from before September 2026 are BGR."""
     return _RGB_MARK in file[: 2**12]
 
 
 def form_of(value: Any) -> str:
-    """Return type and shape, for messages."""
+    """Describe type and shape, for messages."""
     if value is None:
         return "(unreadable)"
     return f"{value.dtype} {list(value.shape)}" if hasattr(value, "shape") else "(a group)"
 
 
 def fault_of(value: Any, are_pictures: bool) -> str:
-    """Return why an observation is not a camera's frames; empty: it is.
+    """Return why an observation is not a camera's frames; empty if it is.
 
     are_pictures: as in ``Layout``
     """
     if not hasattr(value, "shape"):
         return "a group: expected its pictures one level up"
-    if value.is_virtual:  # h5py would show zeros in place of frames that are missing in another file
+    if value.is_virtual:  # h5py would show zeros for frames missing in another file
         return "a virtual dataset: copy its frames into the file"
     if is_encoded(value, are_pictures):
         return ""
@@ -138,7 +138,7 @@ def fault_of(value: Any, are_pictures: bool) -> str:
 
 
 def _is_picture(value: Any, are_pictures: bool) -> bool:
-    """True if an observation may be pictures, also in a form that is not read."""
+    """True if an observation may be pictures, even in an unsupported form."""
     if value is None:  # it may have been one
         return True
     if not hasattr(value, "shape"):
@@ -150,7 +150,7 @@ def _is_picture(value: Any, are_pictures: bool) -> bool:
 
 
 def is_encoded(value: Any, are_pictures: bool) -> bool:
-    """True for an array of files. are_pictures: False: its first frame must begin as a JPEG or PNG file"""
+    """True for an array of files. are_pictures: False: the first frame must begin like a JPEG or PNG file."""
     kinds = {1: "OSV", 2: "u"}
     if not value.shape or not value.shape[0] or value.dtype.kind not in kinds.get(len(value.shape), ""):
         return False
@@ -166,7 +166,7 @@ def _first_file(value: Any) -> bytes:
 
 
 def pictures_in(demos: Mapping[int, tuple[str, Any]], are_pictures: bool) -> Mapping[str, Mapping[int, str]]:
-    """Return faults by picture and demonstration; "" for no fault."""
+    """Return faults by picture and demonstration; "" means no fault."""
     observations = {number: (name, _observations(demo)) for number, (name, demo) in demos.items()}
     values = [(name, value) for _, stored in observations.values() for name, value in stored.items()]
     found = {name: None for name, value in values if _is_picture(value, are_pictures)}
@@ -182,7 +182,7 @@ def pictures_in(demos: Mapping[int, tuple[str, Any]], are_pictures: bool) -> Map
 
 
 def forms_in(demos: Mapping[int, tuple[str, Any]]) -> Mapping[int, str]:
-    """Return descriptions of the observations by demonstration, for messages."""
+    """Describe the observations by demonstration, for messages."""
     found = {number: _observations(demo) for number, (_, demo) in demos.items()}
     return {
         n: ", ".join(f"{name} {form_of(value)}" for name, value in each.items()) or "none" for n, each in found.items()
@@ -192,7 +192,7 @@ def forms_in(demos: Mapping[int, tuple[str, Any]]) -> Mapping[int, str]:
 def first_files(
     demos: Mapping[int, tuple[str, Any]], pictures: Mapping[str, Mapping[int, str]], are_pictures: bool
 ) -> Mapping[str, bytes]:
-    """Return the first file of each camera whose frames are files."""
+    """Return the first file for each camera whose frames are files."""
     stored = (
         (camera, demo["obs"][camera])
         for n, (_, demo) in demos.items()
@@ -216,7 +216,7 @@ def _observations(demo: Any) -> Mapping[str, Any]:
 
 
 def _is_known(value: Any) -> bool:
-    """True for a group, and an array of numbers or texts that NumPy knows."""
+    """True for a group, or an array with numbers or texts that NumPy knows."""
     try:
         return hasattr(value, "keys") or (getattr(value, "shape", None) is not None and bool(value.dtype.kind))
     except (TypeError, OSError, RuntimeError):

@@ -31,7 +31,7 @@ from rfm_labels.datasets.lerobot_meta import (
 from rfm_labels.datasets.lerobot_rows import TASK_COLUMN, RowReader, Sentences, has_numbers, read_sentences, table_of
 from rfm_labels.datasets.stored_files import Span, Times, digest_of, faults_at, file_identity, turn_mark
 
-_VIDEOS_AT_A_TIME = 4  # whose packets stay in memory, or one of each camera
+_VIDEOS_AT_A_TIME = 4  # packets of this many videos, or one per camera, stay in memory
 _CONTAINER = {".mp4": "mov"}  # FFmpeg's names by suffix. Otherwise FFmpeg would open the files that a playlist names
 _LISTED_IN = dict.fromkeys(("v2.0", "v2.1"), EPISODES_FILE) | {"v3.0": EPISODES_FOLDER}
 _BY_PLACE = "LeRobot finds a sentence by position, so it may read a different one"
@@ -40,8 +40,8 @@ _BY_PLACE = "LeRobot finds a sentence by position, so it may read a different on
 class LeRobotDataset(Dataset):
     """A LeRobot dataset in a local folder.
 
-    source, revision: id and commit on the Hub; None for a local dataset
-    tolerance_s: most seconds between a row and its frame, as LeRobot's ``tolerance_s``
+    source, revision: Hub id and commit; None for a local dataset
+    tolerance_s: largest gap between a row and its frame, as in LeRobot's ``tolerance_s``
     """
 
     def __init__(
@@ -69,11 +69,11 @@ class LeRobotDataset(Dataset):
         self.corrections = corrections.of_cameras(self.cameras)
         entries = list(read_entries(info))
         self._entries = dict(entries)
-        self.numbers = sorted(self._entries)  # may have gaps, where episodes were deleted
+        self.numbers = sorted(self._entries)  # may have gaps where episodes were deleted
         self.given_task = task
         self._rows = RowReader(root / "data", self._sentences(), task)
         self._rows_in = lru_cache(max(_VIDEOS_AT_A_TIME, len(info.videos)))(self._read_video)
-        self._clocks: dict[int, str] = {}  # of the episodes that are read
+        self._clocks: dict[int, str] = {}  # for the episodes read so far
         numbers = Counter(number for number, _ in entries)
         twice = [number for number in self.numbers if numbers[number] > 1]
         require(root / "meta", not twice, "each episode once", f"{listed(twice)} several times")
@@ -87,7 +87,7 @@ class LeRobotDataset(Dataset):
                 self.notes = [*self.notes, note]
 
     def _sentences(self) -> Sentences:
-        """The meaning of the task column. Raises DatasetError for an unknown column or a broken task table."""
+        """How to interpret the task column. Raises DatasetError for an unknown column or a broken task table."""
         if self.given_task.overrides:
             return Sentences()
         column = self.given_task.column or TASK_COLUMN
@@ -101,7 +101,7 @@ class LeRobotDataset(Dataset):
         return Sentences(column, str(shown.with_suffix("")), sentences)
 
     def _types_of_rows(self) -> tuple[Path | None, Mapping[str, str]]:
-        """The first readable table of rows, and its column types."""
+        """The first readable row table, and its column types."""
         for entry in self._entries.values():
             try:
                 if isinstance(entry, Entry):
@@ -144,11 +144,11 @@ class LeRobotDataset(Dataset):
                 yield Picture(image).pixels()
 
     def times_s(self, episode: DatasetEpisode) -> Times:
-        """Return float64 [T], each frame's time from the start of the episode. Raises DatasetError."""
+        """Return frame times from the episode's start, float64 [T]. Raises DatasetError."""
         return self._rows.read(self._entry(episode.index)).times_s
 
     def span(self, episode: DatasetEpisode, camera: str) -> Span:
-        """Return the episode's frames in that video. Raises DatasetError if a row has no frame of its own."""
+        """Return the episode's frames in the camera's video. Raises DatasetError if a row has no frame of its own."""
         rows, frames = self._frames_of(episode, camera)
         tolerance_s = 0.5 * rows.apart_s(frames)
         return Span(rows.video, rows.video.packets.times_s[frames], tolerance_s, f"{episode.name}: {camera}")
@@ -160,7 +160,7 @@ class LeRobotDataset(Dataset):
         return entry
 
     def _frames_of(self, episode: DatasetEpisode, camera: str) -> tuple[VideoRows, Frames]:
-        """An episode's video, and the numbers of its frames in it."""
+        """An episode's video, and the numbers of its frames there."""
         rows = self._rows_in(camera, self._entry(episode.index).video(camera)[0])
         frames = rows.frames[episode.index]
         if isinstance(frames, DatasetError):
@@ -177,7 +177,7 @@ class LeRobotDataset(Dataset):
         return found
 
     def _read_video(self, camera: str, file: Path) -> VideoRows:
-        """A video with the rows of all readable episodes in it."""
+        """A video with the rows from all readable episodes in it."""
         video = Video(file, _CONTAINER.get(file.suffix.lower()))
         with faults_at(file):
             require(file, len(video.packets.times_s) > 0, "frames with time stamps", "none")

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Frames of LeRobot rows in a video, found by time as LeRobot's reader finds them.
+"""Match LeRobot rows to video frames by time, as LeRobot's reader does.
 
-A row's frame is the frame nearest to the episode's start in the video plus the row's time, within a tolerance. Frames
+A row's frame is the one nearest to the episode's start in the video plus the row's time, within a tolerance. Frames
 without a row, from discarded takes and trimmed episodes, are skipped. Two rows with the same frame are an error:
-LeRobot reads them, but the start or length of an episode must be wrong.
+LeRobot reads them, but an episode's start or length must be wrong.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _AGAIN = "write the dataset again, or leave this episode out (--episodes)"
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """The rows of one episode in a video. times_s: float64 [T], rising, in the video"""
+    """One episode's rows in a video. times_s: float64 [T], rising, in the video."""
 
     number: int
     where: str
@@ -39,10 +39,10 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class VideoRows:
-    """A video and the rows that are known to lie in it.
+    """A video, and the rows known to lie in it.
 
-    fps: rows a second
-    tolerance_s: most seconds between a row and its frame
+    fps: rows per second
+    tolerance_s: largest gap between a row and its frame
     """
 
     camera: str
@@ -53,7 +53,7 @@ class VideoRows:
 
     @cached_property
     def frames(self) -> Mapping[int, Frames | DatasetError]:
-        """Frame numbers of the rows by episode, int64 [T], or the error of a faulty episode."""
+        """Frame numbers by episode, int64 [T], or a faulty episode's error."""
         best, *others = self._matches
         starts = np.cumsum([0, *(len(part.times_s) for part in self.parts)])
         found: dict[int, Frames | DatasetError] = {}
@@ -70,7 +70,7 @@ class VideoRows:
         return found
 
     def apart_s(self, frames: Frames) -> float:
-        """Return the shortest time between one of these frames and a neighbour, at most the time between two rows."""
+        """Return the shortest time between one of these frames and a neighbour, at most the row interval."""
         gaps_s = np.diff(self.video.packets.times_s, prepend=-np.inf, append=np.inf)
         return min(1 / self.fps, float(np.minimum(gaps_s[frames], gaps_s[frames + 1]).min()))
 
@@ -84,7 +84,7 @@ class VideoRows:
 
     @cached_property
     def _matches(self) -> list[_Match]:
-        """Matches, best first. LeRobot counts times from 0; if a video begins later, they may count from there."""
+        """Matches, best first. LeRobot counts times from 0; if a video begins later, they may count from its start."""
         times_s = self.video.packets.times_s
         zeros_s = [times_s[0], 0.0] if times_s[0] > self.tolerance_s else [0.0]
         rounding_s = min(self.video.packets.tick_s, 0.25 / self.fps)
@@ -94,7 +94,7 @@ class VideoRows:
         return sorted(matches, key=lambda match: int(match.is_faulty.sum()))
 
     def _fault(self, match: _Match, part: Part, rows: slice) -> DatasetError:
-        """The error of an episode's first faulty row."""
+        """The error for an episode's first faulty row."""
         k = rows.start + int(np.argmax(match.is_faulty[rows]))
         times_s, frame, expected_s = self.video.packets.times_s, match.frames[k], match.expected_s[k]
         where = f"{part.where}, row {k - rows.start}: {self._where}"
@@ -115,7 +115,7 @@ class VideoRows:
 
     @property
     def _rates(self) -> str:
-        """A note on the frame rates of video and rows; empty if they are equal."""
+        """A note on the video's and the rows' frame rates; empty if they are equal."""
         if not self.video.packets.fps or f"{self.video.packets.fps:.2f}" == f"{self.fps:.2f}":
             return ""
         return f" (the video has {self.video.packets.fps:.2f} frames a second, meta/info.json says {self.fps:g})"
@@ -135,12 +135,12 @@ class VideoRows:
 
 @dataclass(frozen=True, eq=False)
 class _Match:
-    """The nearest frame of each of N rows, among M frames.
+    """The nearest frame for each of N rows, among M frames.
 
-    frames: int64 [N], number of the frame
-    expected_s, late_s: float64 [N], time of the row in the video, and delay after the time of the frame
+    frames: int64 [N], frame number
+    expected_s, late_s: float64 [N], the row's time in the video, and its delay after the frame's time
     is_far: bool [N], the frame is too far away
-    num_rows: int64 [M], number of rows per frame
+    num_rows: int64 [M], rows per frame
     """
 
     frames: Frames

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Metadata of a LeRobot dataset: ``meta/info.json``, and an entry for each episode. Needs pyarrow.
+"""Metadata in a LeRobot dataset: ``meta/info.json``, and an entry per episode. Needs pyarrow.
 
-In v2.0 and v2.1 each episode has a table, and a video of each camera. In v3.0 many share a table and a video, found by
-file numbers and time stamps.
+In v2.0 and v2.1 each episode has its own table, and a video per camera. In v3.0 many episodes share a table and a
+video, located by file numbers and time stamps.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ VERSIONS = ("v2.0", "v2.1", "v3.0")
 EPISODES_FILE = Path("meta", "episodes.jsonl")
 EPISODES_FOLDER = Path("meta", "episodes")
 
-_OF_PICTURES = ("info", "video_info")  # keys in a feature of a camera, by version of the writer
+_OF_PICTURES = ("info", "video_info")  # keys in a camera feature, by writer version
 _DEPTH_MARKS = ("video.is_depth_map", "is_depth_map")
 _CAMERA_KINDS = ("video", "image")
 _OF_AN_EPISODE = (
@@ -36,11 +36,11 @@ _OF_A_VIDEO = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 class Info:
     """Contents of ``meta/info.json``.
 
-    videos, images: keys of cameras with frames in video files, and in tables
-    depth: keys of the depth cameras in both
+    videos, images: cameras with frames in video files, and in tables
+    depth: depth cameras among both
     left_out: other cameras, with the reason
-    total_frames: of all episodes
-    data_path, video_path: templates of file paths
+    total_frames: over all episodes
+    data_path, video_path: file path templates
     notes: lines for the caller
     """
 
@@ -60,7 +60,7 @@ class Info:
 
     @classmethod
     def read(cls, root: Path) -> Info:
-        """Return the information in ``root``. Raises DatasetError."""
+        """Read the information in ``root``. Raises DatasetError."""
         file = root / INFO_FILE
         try:
             document = json.loads(file.read_bytes())
@@ -121,7 +121,7 @@ def _is_depth(feature: Mapping[str, Any]) -> bool:
 
 
 def _no_colours(feature: Mapping[str, Any]) -> str:
-    """Why nothing can show a camera: it stores distances in a single channel; empty: it has colours."""
+    """Why a camera cannot be shown: it stores distances in a single channel; empty if it has colours."""
     shape = feature.get("shape")
     is_flat = isinstance(shape, list) and shape[-1:] == [1]
     is_map = feature.get("dtype") in _CAMERA_KINDS and is_flat and _is_depth(feature)
@@ -130,12 +130,12 @@ def _no_colours(feature: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Entry:
-    """Metadata of one episode, in the same form for all versions.
+    """One episode's metadata, in the same form for all versions.
 
     tasks: sentences in the metadata
-    first_index: the dataset's number of its first frame; None: only the rows have it
-    data_file: Parquet file with its rows, as the metadata say
-    videos: by camera, the video file and the episode's start in it, in seconds, or the fault of their metadata
+    first_index: dataset-wide number of the first frame; None: only the rows have it
+    data_file: Parquet file with the rows, as the metadata say
+    videos: by camera, the video file and the episode's start there, in seconds, or an error in the metadata
     """
 
     index: int
@@ -159,7 +159,7 @@ class Entry:
 
 
 def read_table(file: Path, columns: list[str] | None = None, filters: Any = None) -> Any:
-    """Return a Parquet file's table. Raises DatasetError for a missing or broken file, or a missing column."""
+    """Read a Parquet table. Raises DatasetError for a missing or broken file, or a missing column."""
     try:
         import pyarrow
         from pyarrow import parquet
@@ -177,7 +177,7 @@ def read_table(file: Path, columns: list[str] | None = None, filters: Any = None
 
 
 def column_types(file: Path) -> Mapping[str, str]:
-    """Return the column types of a Parquet file, as pyarrow names them. Raises DatasetError for a broken file."""
+    """Return a Parquet file's column types, as pyarrow names them. Raises DatasetError for a broken file."""
     from pyarrow import ArrowException, parquet
 
     try:
@@ -187,7 +187,7 @@ def column_types(file: Path) -> Mapping[str, str]:
 
 
 def read_entries(info: Info) -> Iterator[tuple[int, Entry | DatasetError]]:
-    """Yield the number of each episode with its metadata, or with their fault. Raises DatasetError."""
+    """Yield each episode's number with its metadata or fault. Raises DatasetError."""
     return _entries_v30(info) if info.version == "v3.0" else _entries_v21(info)
 
 
@@ -246,7 +246,7 @@ def _entry_v30(info: Info, file: Path, row: dict[str, Any]) -> Entry:
 
 
 def _video(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float] | DatasetError:
-    """A camera's video, and the episode's start in it, or a fault, which counts if the camera is asked for."""
+    """A camera's video and the episode's start in it, or a fault, which counts only if the camera is used."""
     names = [f"videos/{key}/{name}" for name in _OF_A_VIDEO]
     try:
         for name in names:
@@ -260,16 +260,16 @@ def _video(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path,
 def _place(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float]:
     chunk, number, from_s, to_s = (row[f"videos/{key}/{name}"] for name in _OF_A_VIDEO)
     lasts_s, expected_s = to_s - from_s, row["length"] / info.fps
-    is_long_enough = lasts_s >= expected_s - 0.5 / info.fps  # longer: with frames of a discarded take
+    is_long_enough = lasts_s >= expected_s - 0.5 / info.fps  # longer: includes frames from a discarded take
     expected = f"{expected_s:.4f} s for {row['length']} frames"
     require(f"{where}: videos/{key}: from_timestamp to to_timestamp", is_long_enough, expected, f"{lasts_s:.4f} s")
     return info.path(info.video_path, video_key=key, chunk_index=chunk, file_index=number), float(from_s)
 
 
 def json_lines(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield each object of a file of JSON lines, after its place for messages. Raises DatasetError."""
+    """Yield the objects in a JSON lines file, each after its place for messages. Raises DatasetError."""
     try:
-        texts = file.read_text(encoding="utf-8-sig").split("\n")  # a sentence may have other separators of lines
+        texts = file.read_text(encoding="utf-8-sig").split("\n")  # a sentence may contain other line separators
     except FileNotFoundError as error:
         raise DatasetError.at(file, "a file of JSON lines", "none") from error
     except (OSError, UnicodeDecodeError) as error:
@@ -287,5 +287,5 @@ def json_lines(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
 
 
 def number_in(where: str, line: Mapping[str, Any], name: str) -> int:
-    """Return a whole number of 0 or more in a line of JSON. Raises DatasetError."""
+    """Read a whole number, 0 or more, from a JSON line. Raises DatasetError."""
     return checked_count(f"{where}: {name}", line.get(name), least=0, error=DatasetError)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Rows of a LeRobot dataset: the times and the task of each frame of an episode. Needs pyarrow.
+"""Rows in a LeRobot dataset: the time and task for each frame in an episode. Needs pyarrow.
 
-The column of the tasks has sentences, numbers of sentences in a table of ``meta``, or LeRobot's
-``language_persistent``, in which each entry with the style ``subtask`` holds from its time on. T rows of an episode.
+The task column holds sentences, sentence numbers from a table in ``meta``, or LeRobot's ``language_persistent``, where
+an entry with the style ``subtask`` holds from its time on. T rows per episode.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from rfm_labels.datasets.stored_files import digest_of
 TASK_COLUMN = "task_index"
 
 _ROW_COLUMNS = ("index", "episode_index", "frame_index", "timestamp")
-_TASKS = "tasks"  # key of the column that names the tasks
-_REGULAR_S, _FLOAT32 = 1e-4, 1e-7  # absolute and relative errors of a time stamp, a float32
-_FILES_AT_A_TIME = 4  # whose rows stay in memory
+_TASKS = "tasks"  # key for the column that names the tasks
+_REGULAR_S, _FLOAT32 = 1e-4, 1e-7  # time stamp error: absolute, and relative for float32
+_FILES_AT_A_TIME = 4  # how many files' rows stay in memory
 _FOLLOW_THE_ROWS = "correct it, or follow the rows, as LeRobot's reader does: --task-column task_index"
 _NUMBERS = re.compile(r"u?int\d+")
-_WHOLE_OR_NOT = re.compile(r"halffloat|float|double")  # numbers beside missing values
+_WHOLE_OR_NOT = re.compile(r"halffloat|float|double")  # whole numbers become floats beside missing values
 _SENTENCES = re.compile(r"(dictionary<values=)?(large_)?string\b.*")
 _IDENTITY = ("index", "episode_index", "frame_index")
 _STYLE = "subtask"
-_INDEX_OF_PANDAS = "__index_level_0__"  # column of an index without a name
+_INDEX_OF_PANDAS = "__index_level_0__"  # pandas' column name for an unnamed index
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodeRows:
-    """The rows of one episode.
+    """The rows in one episode.
 
-    times_s: float64 [T], rising, from the start of the episode
-    tasks: first row and task of each stretch of rows with the same task
+    times_s: float64 [T], rising, from the episode's start
+    tasks: (first row, task) for each stretch of rows with the same task
     """
 
     first_index: int
@@ -57,9 +57,9 @@ class EpisodeRows:
 
 
 class RowReader:
-    """Reads and checks rows. Keeps the columns of the latest files.
+    """Reads and checks rows. Caches the columns from the latest files.
 
-    data: folder of all rows
+    data: folder with all rows
     tasks: sentences by number
     given: the caller's task
     """
@@ -71,7 +71,7 @@ class RowReader:
         self._columns = lru_cache(_FILES_AT_A_TIME)(_read_columns)
 
     def read(self, entry: Entry) -> EpisodeRows:
-        """Return the episode's rows. Raises DatasetError if they contradict its metadata."""
+        """Read the episode's rows. Raises DatasetError if they contradict its metadata."""
         file = self.file_of(entry)
         columns = self._columns(file, self._tasks.column)
         own = np.flatnonzero(columns["episode_index"] == entry.index)
@@ -95,17 +95,17 @@ class RowReader:
         )
 
     def file_of(self, entry: Entry) -> Path:
-        """Return the file with the episode's rows. Raises DatasetError if that of its metadata cannot be read.
+        """Return the file with the episode's rows. Raises DatasetError if the file in the metadata is unreadable.
 
-        LeRobot reads all files and selects by ``episode_index``, so the converter of LeRobot 0.4.0 could name the file
-        before.
+        LeRobot 0.4.0's converter could name the previous file. LeRobot does not notice, since it reads all files and
+        selects by ``episode_index``.
         """
         stored = self._columns(entry.data_file, self._tasks.column)["episode_index"]
         return entry.data_file if (stored == entry.index).any() else self._files.get(entry.index, entry.data_file)
 
     @cached_property
     def _files(self) -> Mapping[int, Path]:
-        """The file of each episode's rows. A broken file has none."""
+        """File by episode number; broken files are skipped."""
         found: dict[int, Path] = {}
         for file in sorted(self._data.rglob("*.parquet")):
             with suppress(DatasetError):
@@ -131,7 +131,7 @@ class RowReader:
 
 
 def _read_columns(file: Path, task_column: str) -> Mapping[str, Any]:
-    """The columns of a file; integers are int64, and -1 where the table has none."""
+    """Read a file's columns; integers become int64, and missing ones -1."""
     import pyarrow
 
     table = read_table(file, list(dict.fromkeys([*_ROW_COLUMNS, task_column])))
@@ -148,9 +148,9 @@ def _read_columns(file: Path, task_column: str) -> Mapping[str, Any]:
 
 @dataclass(frozen=True)
 class Sentences:
-    """What the values of a column mean.
+    """How to interpret a column's values.
 
-    table: name of the sentence table, for messages
+    table: the sentence table's name, for messages
     by_number: sentences by number
     """
 
@@ -159,7 +159,7 @@ class Sentences:
     by_number: Mapping[int, str | None] = field(default_factory=dict)
 
     def find(self, value: Any) -> tuple[str, Any]:
-        """Return where the sentence of a value is, for messages, and the sentence."""
+        """Return the sentence for a value, after its place for messages."""
         if value is None or isinstance(value, str):
             return self.column, value
         sentence = self.by_number.get(int(value)) if float(value).is_integer() else value
@@ -167,9 +167,9 @@ class Sentences:
 
 
 def table_of(info: Info, column: str) -> tuple[Path, str]:
-    """Return the sentence table of a column, and the name of the sentences in it.
+    """Return a column's sentence table, and the key for its sentences.
 
-    ``subtask_index`` has numbers of ``meta/subtasks`` if that exists; other columns have numbers of ``meta/tasks``.
+    ``subtask_index`` refers to ``meta/subtasks`` if that exists; other columns refer to ``meta/tasks``.
     """
     tasks = info.root / "meta" / ("tasks.parquet" if info.version == "v3.0" else "tasks.jsonl")
     name = column.removesuffix("_index")
@@ -188,7 +188,7 @@ def _by_number(file: Path, sentences: Iterable[tuple[int, str | None]]) -> dict[
 def has_numbers(file: Path, types: Mapping[str, str], column: str) -> bool:
     """True if a column has numbers, False if it has sentences or subtasks. Raises DatasetError for another column.
 
-    file: table of rows, for messages
+    file: row table, for messages
     types: column types, as pyarrow names them
     """
     usable = {name: kind for name, kind in types.items() if _is_usable(kind) and name not in _IDENTITY}
@@ -198,7 +198,7 @@ def has_numbers(file: Path, types: Mapping[str, str], column: str) -> bool:
 
 
 def values_of(column: Any) -> Any:
-    """Return the values of a pyarrow column: whole numbers, or objects. A column of subtasks stays as it is."""
+    """Convert a pyarrow column to whole numbers or objects. A subtask column stays as it is."""
     kind = str(column.type)
     if _is_language(kind):
         return column
@@ -211,11 +211,11 @@ def values_of(column: Any) -> Any:
 
 
 def values_in(where: str, column: Any, own: npt.NDArray[np.int64], times_s: npt.NDArray[np.float64]) -> Any:
-    """Return the values of an episode's rows, an array [T]. Raises DatasetError for two subtasks at one time.
+    """Return one value per row in the episode, [T]. Raises DatasetError for two subtasks at one time.
 
     column: as ``values_of`` returns it
     own: int64 [T], positions of the episode's rows
-    times_s: float64 [T], times of the rows
+    times_s: float64 [T], row times
     """
     if isinstance(column, np.ndarray):
         return column[own]
@@ -238,11 +238,11 @@ def _is_language(kind: str) -> bool:
 
 
 def read_sentences(file: Path, name: str = "task") -> dict[int, str | None]:
-    """Return each sentence of a table of ``meta`` by its number. Raises DatasetError.
+    """Read sentences by number from a table in ``meta``. Raises DatasetError.
 
-    name: key of the sentences, in JSON lines; the numbers have the key ``<name>_index``
+    name: key for the sentences in JSON lines; the key for the numbers is ``<name>_index``
 
-    In Parquet, the sentences are the index of a pandas table. The column's name depends on the version of its writer.
+    In Parquet, the sentences are a pandas index, whose column name depends on the writer's version.
     """
     if file.suffix != ".parquet":
         lines = [(number_in(where, line, f"{name}_index"), line.get(name, "")) for where, line in json_lines(file)]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Open a dataset by path or Hub id, or say how to convert its layout.
+"""Open a dataset by path or Hub id, or explain how to convert an unsupported layout.
 
-``tasks.csv`` lists the episodes of a folder in order. Its columns ``video`` (or ``episode``) and ``task`` lie between
-commas, semicolons or tabs. A task with a comma is in quotes. Paths are relative to the table.
+``tasks.csv`` lists a folder's episodes in order. The columns ``video`` (or ``episode``) and ``task`` are separated by
+commas, semicolons or tabs. Quote a task that contains the separator. Paths are relative to the table.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from rfm_labels.datasets.rlds import RldsDataset, rlds_folder
 from rfm_labels.datasets.rlds_files import FEATURES_FILE
 
 TABLE = "tasks.csv"
-_NAMES = ("video", "episode")  # columns of the path
+_NAMES = ("video", "episode")  # column names for the path
 _DELIMITERS = ",;\t"
 _Line: TypeAlias = tuple[str, str, str | None]  # place, path and task
 _HUB_ID = re.compile(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")
@@ -53,7 +53,7 @@ _LAYOUTS = (
 _CONVERT = "convert them to LeRobot, or write each episode's pictures to a video and list the videos in tasks.csv"
 _GIVE_TASK = '--task "SENTENCE"'
 _FILL = "put a video, an array or a folder of pictures for each episode in it"
-_UNREAD = {  # remedies for layouts without a reader, by pattern of file names
+_UNREAD = {  # remedies for layouts without a reader, by file name pattern
     r"meta_data": "a LeRobot dataset of v1: convert it to v2.0 with LeRobot 0.3",
     r".*\.tfrecord.*": f"TFRecord files without {FEATURES_FILE}, which TensorFlow Datasets 4.6 or later writes beside "
     "them: copy the whole folder of the version",
@@ -61,19 +61,19 @@ _UNREAD = {  # remedies for layouts without a reader, by pattern of file names
     r".*\.(bag|mcap|db3)": f"a rosbag: {_CONVERT}",
 }
 _VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov", ".webm", ".avi")
-_SUFFIXES = {"videos": _VIDEO_SUFFIXES, "arrays": ARRAY_SUFFIXES}  # of episodes that are files
-_KINDS: dict[str, tuple[type[EpisodeFiles], str]] = {  # reader, and the name of an episode
+_SUFFIXES = {"videos": _VIDEO_SUFFIXES, "arrays": ARRAY_SUFFIXES}  # for episodes that are files
+_KINDS: dict[str, tuple[type[EpisodeFiles], str]] = {  # reader, and what an episode is called
     "videos": (VideoFolder, "video"),
     "folders of pictures": (FrameFolders, "folder"),
     "arrays": (ArrayFiles, "file"),
     "recordings of Unitree": (UnitreeFolders, "folder"),
 }
 _OWN_TASKS = ("arrays", "recordings of Unitree")
-_FILES_OF_OURS = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside episodes with labels; of 0.4
+_FILES_OF_OURS = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside labelled episodes; HDF5: from 0.4
 
 
 def read_table_of_tasks(table: Path, *, has_tasks: bool) -> Mapping[str, str | None]:
-    """Return the task of each episode, by path; None: no task. Raises DatasetError, which lists all faulty lines.
+    """Read tasks by episode path; None: no task. Raises DatasetError, which lists all faulty lines.
 
     has_tasks: True: the file needs the column ``task``
     """
@@ -98,7 +98,7 @@ def read_table_of_tasks(table: Path, *, has_tasks: bool) -> Mapping[str, str | N
 
 
 def _normal(root: Path, path: str) -> str:
-    """A path without ``./``, outer spaces or Windows backslashes, so that paths of the same file are equal."""
+    """Remove ``./``, outer spaces and Windows backslashes, so that equal paths compare equal."""
     path = path.strip()
     if "\\" in path and not (root / path).exists():
         path = path.replace("\\", "/")
@@ -106,7 +106,7 @@ def _normal(root: Path, path: str) -> str:
 
 
 def _from_csv(table: Path, text: str, has_tasks: bool, faults: list[str]) -> tuple[str, Iterator[_Line]]:
-    """The name of the path column, and the lines."""
+    """The path column's name, and the lines."""
     first, _, _ = text.partition("\n")
     delimiter = next((each for each in _DELIMITERS if not set(_header(first, each)).isdisjoint(_NAMES)), ",")
     columns = _header(first, delimiter)
@@ -122,8 +122,8 @@ def _header(line: str, delimiter: str) -> list[str]:
 
 
 def _lines(table: Path, text: str, delimiter: str, columns: list[str], name: str, faults: list[str]) -> Iterator[_Line]:
-    """The lines below the header, except lines with a wrong number of cells, which go to ``faults``."""
-    has_blanks = re.search(f'{delimiter} +"', text) is not None  # before a quote they would make it a part of the text
+    """The lines below the header. Lines with a wrong cell count go to ``faults`` instead."""
+    has_blanks = re.search(f'{delimiter} +"', text) is not None  # else a quote after spaces would be part of the text
     rows = csv.reader(io.StringIO(text), delimiter=delimiter, skipinitialspace=has_blanks, strict=True)
     try:
         next(rows)
@@ -153,19 +153,19 @@ def open_dataset(
     channels: ChannelOrder | Mapping[str, ChannelOrder] | None = None,
     tolerance_s: float = TOLERANCE_S,
 ) -> Dataset:
-    """Return the dataset at a path, or download the Hub id ``org/name[@revision]``. An existing path wins.
+    """Open the dataset at a path, or download the Hub id ``org/name[@revision]``. An existing path wins.
 
-    task: task of episodes without their own
-    override_task: True: ``task`` is the task of all episodes
-    several_tasks: of a LeRobot episode with several tasks: ``each``: each frame has its own; ``first``: all frames have
+    task: task for episodes without their own
+    override_task: True: use ``task`` for all episodes
+    several_tasks: if a LeRobot episode has several tasks: ``each``: frames keep their own; ``first``: all frames get
         the first frame's, as in LeRobot's own scripts
-    task_column: column of a LeRobot dataset's rows that names the tasks: sentences, numbers of sentences in
-        ``meta/tasks``, or LeRobot's ``language_persistent``; None: ``task_index``, checked against the metadata. Of an
-        RLDS dataset: feature with the sentences
-    orient: turn of the frames: one for all cameras, or a dict by camera, in which "" stands for the others; None: as
-        stored, but HDF5 files marked as LIBERO's are turned
-    channels: order in which the colours are stored, ``rgb`` or ``bgr``: one, or a dict; None: ``rgb``
-    tolerance_s: of a LeRobot dataset's videos: most seconds between a row and its frame, as LeRobot's ``tolerance_s``
+    task_column: in a LeRobot dataset, the row column that names the tasks: sentences, sentence numbers from
+        ``meta/tasks``, or LeRobot's ``language_persistent``; None: ``task_index``, checked against the metadata. In an
+        RLDS dataset, the feature with the sentences
+    orient: how to turn frames: one value for all cameras, or a dict by camera, in which "" stands for the others; None:
+        as stored, except that HDF5 files marked as LIBERO's are turned
+    channels: stored channel order, ``rgb`` or ``bgr``: one value, or a dict; None: ``rgb``
+    tolerance_s: for LeRobot videos: largest gap between a row and its frame, as in LeRobot's ``tolerance_s``
 
     Raises DatasetError.
     """
@@ -196,14 +196,14 @@ def _from_hub(name: str, revision: str | None, **opening: Any) -> LeRobotDataset
         raise DatasetError.at(name, "a local dataset or one of the Hub", f"none: {error}") from error
     if not (folder / INFO_FILE).is_file():
         raise DatasetError.at(name, f"a LeRobot dataset's {INFO_FILE}", _unread(folder) or "none")
-    commit = folder.name  # the name of a snapshot's folder
+    commit = folder.name  # a snapshot's folder is named after the commit
     return LeRobotDataset(folder, source=name, revision=commit, **opening)
 
 
 def open_to_show(source: str) -> LeRobotDataset | Hdf5Dataset | RldsDataset:
-    """Return the dataset of a LeRobot or RLDS folder or an HDF5 file for a viewer. Raises DatasetError.
+    """Open a LeRobot or RLDS folder or an HDF5 file for a viewer. Raises DatasetError.
 
-    Blank and outdated tasks are shown, too, and a row's frame is the nearest, as a player shows it.
+    Accepts blank and outdated tasks. A row shows the nearest frame, as a player does.
     """
     path = Path(source).resolve()
     if is_hdf5(path):
@@ -218,9 +218,9 @@ def open_to_show(source: str) -> LeRobotDataset | Hdf5Dataset | RldsDataset:
 
 
 def hdf5_files(folder: str | Path) -> list[Path]:
-    """Return the HDF5 datasets of a folder and the folders in it; empty if it is no folder, or holds other data.
+    """List the HDF5 datasets in a folder and its subfolders; empty if it is no folder, or holds other data.
 
-    Files of labels and hidden files are left out. The order is that of the paths, with 2 before 10.
+    Label files and hidden files are left out. Paths sort with 2 before 10.
     """
     root = Path(folder)
     is_other = any((root / name).is_file() for name in (INFO_FILE, TABLE))
@@ -232,7 +232,7 @@ def hdf5_files(folder: str | Path) -> list[Path]:
 
 
 def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -> Dataset:
-    """The dataset of a folder with a file or a folder for each episode, or of its table. Raises DatasetError."""
+    """Open a folder with one file or folder per episode, or its table. Raises DatasetError."""
     if path.is_file() and path.suffix.lower() != ".csv":
         raise DatasetError.at(path, _LAYOUTS, _unread(path) or "another file")
     table = path / TABLE if path.is_dir() else path
@@ -248,7 +248,7 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
         return dataset
     kind, names = _listed(path)
     reader, episode = _KINDS[kind]
-    is_of_before = (path / "tasks.json").is_file()  # of 0.4
+    is_of_before = (path / "tasks.json").is_file()  # from 0.4
     is_told = (task.text is not None or kind in _OWN_TASKS) and not is_of_before
     got = f"none: write it, or, if all of them have one task, give it: {_GIVE_TASK}"
     got = f"tasks.json: write it as {TABLE}, with the columns video and task" if is_of_before else got
@@ -257,11 +257,11 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
 
 
 def _unlisted(table: Path, kind: str, names: Collection[str]) -> list[str]:
-    """A line about episodes beside those of a table that the table lacks; empty: it has all."""
+    """A note on episodes that lie beside the table's but are not listed; empty if there are none."""
     names = {str(Path(name).parent) if is_pattern(Path(name)) else name for name in names}
     beside = {table.parent, *((table.parent / name).parent for name in names)} if kind in _SUFFIXES else {table.parent}
     found = [folder / name for folder in sorted(beside) if folder.is_dir() for name in _found(folder).get(kind, ())]
-    if kind == "folders of pictures":  # ``_found`` has those without pictures, too
+    if kind == "folders of pictures":  # ``_found`` also has folders without pictures
         found = [each for each in found if any(_is_frame(file) for file in each.iterdir())]
     gone = in_natural_order({Path(os.path.relpath(each, table.parent)).as_posix() for each in found} - set(names))
     told = f"{table.name}: {len(gone)} {kind} beside it are not listed and get no labels: {first_names(gone)}"
@@ -275,7 +275,7 @@ def _kind_of(path: Path) -> str:
 
 
 def _listed(folder: Path) -> tuple[str, list[str]]:
-    """The kind of a folder's episodes, and their names. Raises DatasetError for several kinds, or none."""
+    """The kind and names of the episodes in a folder. Raises DatasetError for several kinds, or none."""
     found = _found(folder)
     told = " and ".join(f"{kind} ({names[0]})" for kind, names in found.items())
     got = f"{told}: list the episodes of one kind in tasks.csv"
@@ -287,7 +287,7 @@ def _listed(folder: Path) -> tuple[str, list[str]]:
 
 
 def _found(folder: Path) -> dict[str, list[str]]:
-    """Names of what may be episodes, by kind, without hidden files and files of labels."""
+    """Names that may be episodes, by kind, without hidden files and label files."""
     shown = [folder / name for name in _names_in(folder)]
     files = [each for each in shown if each.is_file() and not _FILES_OF_OURS.fullmatch(each.name)]
     folders = [each for each in shown if each.is_dir() and each.name != SIGNALS_FOLDER]
@@ -314,7 +314,7 @@ def _names_in(folder: Path) -> list[str]:
 
 
 def _unread(path: Path) -> str | None:
-    """A known layout without a reader, and its remedy; None: the layout is unknown."""
+    """Describe a known layout without a reader, and the remedy; None: unknown layout."""
     found = [path] if path.is_file() else [each for below in ("*", "*/*") for each in path.glob(below)]
     names = [path.name, *(each.name for each in found)]
     for pattern, what in _UNREAD.items():

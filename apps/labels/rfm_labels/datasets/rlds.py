@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""RLDS datasets, such as those of Open X-Embodiment, read without TensorFlow. Needs ``rfm-labels[rlds]`` and Pillow.
+"""RLDS datasets, such as Open X-Embodiment, read without TensorFlow. Needs ``rfm-labels[rlds]`` and Pillow.
 
-An episode is a record of a TFRecord file. The splits follow each other, and are the filter keys. The frames are JPEG or
-PNG files in ``steps/observation/<camera>``; the task is an instruction in the steps or in the episode.
+An episode is one record in a TFRecord file. Splits follow each other and serve as filter keys. Frames are JPEG or PNG
+files in ``steps/observation/<camera>``; the task is an instruction in the steps or in the episode.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from rfm_labels.datasets.stored_files import digest_of, faults_at
 
 
 def rlds_folder(path: Path) -> Path | None:
-    """Return the folder of an RLDS dataset: ``path``, or its only version; None: it is none. Raises DatasetError."""
+    """Return an RLDS dataset's folder: ``path``, or its only version; None: no RLDS dataset. Raises DatasetError."""
     if not path.is_dir() or (path / FEATURES_FILE).is_file():
         return path if path.is_dir() else None
     versions = sorted(file.parent for file in path.glob(f"*/{FEATURES_FILE}"))
@@ -43,8 +43,8 @@ def rlds_folder(path: Path) -> Path | None:
 class _Pictures:
     """One camera's pictures in an episode.
 
-    blank: what all of them show, if they are one black or flat picture; else empty
-    fault: of the first broken one
+    blank: what they show, if all are one black or flat picture; else empty
+    fault: the first broken picture's error
     """
 
     digest: str
@@ -54,10 +54,10 @@ class _Pictures:
 
 @dataclass(frozen=True)
 class _Record:
-    """What the dataset keeps of a record.
+    """What the dataset caches from a record.
 
-    instruction: name of the feature with the texts
-    texts: first step and instruction of each stretch of steps with one
+    instruction: the feature that holds the texts
+    texts: (first step, instruction) for each stretch with one instruction
     """
 
     num_steps: int
@@ -67,7 +67,7 @@ class _Record:
 
 
 class RldsDataset(Dataset):
-    """The episodes of all splits.
+    """The episodes in all splits.
 
     task: task from the caller
     corrections: corrections from the caller
@@ -96,7 +96,7 @@ class RldsDataset(Dataset):
         self._firsts = [0]
 
     def read_episode(self, number: int) -> DatasetEpisode:
-        """Read an episode, and count the frames before it; a broken one before it has none. Raises DatasetError."""
+        """Read an episode, and count the frames before it; broken episodes count as empty. Raises DatasetError."""
         record = self._record(number)
         stretches = self._tasks(number, record)
         while len(self._firsts) <= number:
@@ -136,7 +136,7 @@ class RldsDataset(Dataset):
                 yield Picture(picture).pixels()
 
     def _record(self, number: int) -> _Record:
-        """What a record holds; only the first call reads it. Raises DatasetError."""
+        """Read a record, cached after the first call. Raises DatasetError."""
         if number not in self._records:
             features, where = self._features(number), self._where(number)
             stored = {camera: self._values(features, name) for camera, name in self._info.cameras.items()}
@@ -165,13 +165,13 @@ class RldsDataset(Dataset):
         return record.num_steps if record else 0
 
     def _instruction(self, features: Mapping[str, Any]) -> str:
-        """The first feature with an instruction that is not blank; else the first of all, or none."""
+        """The first feature with a non-blank instruction; else the first feature, or none."""
         known = self._info.instructions
         said = (name for name in known if any(not is_blank(_shown(text)) for text in self._values(features, name)))
         return next(said, known[0] if known else "")
 
     def _tasks(self, number: int, record: _Record) -> list[tuple[int, str]]:
-        """First frame and task of each stretch of frames with one task. Raises DatasetError."""
+        """First frame and task for each stretch with one task. Raises DatasetError."""
         where = f"{self._where(number)}: {record.instruction or ' or '.join(INSTRUCTIONS)}"
         texts = record.texts if record.texts and not self.given_task.overrides else [(0, b"")]
         texts = texts[:1] if self.given_task.several == "first" else texts

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Files of an RLDS dataset, as TensorFlow Datasets writes them. Needs ``rfm-labels[rlds]``, no TensorFlow.
+"""Read RLDS files, as written by TensorFlow Datasets. Needs ``rfm-labels[rlds]``, no TensorFlow.
 
-The metadata are in ``dataset_info.json`` and ``features.json``. An episode is a record of a TFRecord file: uint64
-length, CRC of the length, content, CRC of the content; little-endian. A CRC is CRC-32C, rotated by 15 bits, plus a
-constant. The content is a ``tf.train.Example``.
+The metadata are in ``dataset_info.json`` and ``features.json``. An episode is one record in a TFRecord file: uint64
+length, length CRC, content, content CRC; little-endian. A CRC is CRC-32C, rotated by 15 bits, plus a constant. The
+content is a ``tf.train.Example``.
 
 Format: tensorflow/core/lib/io/record_writer.h and tensorflow/core/example/example.proto.
 """
@@ -28,7 +28,7 @@ _HEAD = struct.Struct("<QI")
 _CRC = struct.Struct("<I")
 _CRC_CONSTANT = 0xA282EAD8
 _AGAIN = "copy or download the file again, or leave the episode out (--episodes)"
-_SCHEMA = {  # fields of the messages: name, type, message
+_SCHEMA = {  # message fields: name, type, message
     "BytesList": [("value", "BYTES", "")],
     "FloatList": [("value", "FLOAT", "")],
     "Int64List": [("value", "INT64", "")],
@@ -50,16 +50,16 @@ _INSTRUCTION = re.compile(rf"({'|'.join(INSTRUCTIONS)})(?:_(\d+))?")  # DROID nu
 class RecordFile:
     """A TFRecord file with random access. Opening it reads nothing.
 
-    num_records: as the metadata of the dataset say
+    num_records: according to the dataset's metadata
     """
 
     def __init__(self, file: Path, num_records: int) -> None:
         self.file = file
         self._num_records = num_records
-        self._starts = [0]  # of the records found so far, and of the next
+        self._starts = [0]  # offsets of the records found so far, and of the next
 
     def record(self, number: int) -> bytes:
-        """Return a record. Raises DatasetError if it or a length before it is damaged, or the file has others."""
+        """Return a record. Raises DatasetError for a damaged record, a damaged length before it, or extra records."""
         try:
             with self.file.open("rb") as opened:
                 starts = list(self._starts)  # a copy, since threads share the file
@@ -99,7 +99,7 @@ class RecordFile:
 
 
 def check_packages() -> None:
-    """Raise ImportError without the packages that read records."""
+    """Raise ImportError if the packages for reading records are missing."""
     try:
         import google.protobuf  # noqa: F401
         import google_crc32c  # noqa: F401
@@ -108,7 +108,7 @@ def check_packages() -> None:
 
 
 def features_of(record: bytes, where: object) -> Mapping[str, Any]:
-    """Return the features of a ``tf.train.Example`` by name, as messages ``Feature``. Raises DatasetError."""
+    """Return the ``Feature`` messages in a ``tf.train.Example`` by name. Raises DatasetError."""
     from google.protobuf.message import DecodeError
 
     example = _example_type()()
@@ -128,7 +128,7 @@ def _masked_crc(content: bytes) -> int:
 
 @lru_cache
 def _example_type() -> Any:
-    """The message type, in a pool of its own: TensorFlow in the same process registers the same names."""
+    """The message type, in a private pool: TensorFlow in the same process registers the same names."""
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
     field = descriptor_pb2.FieldDescriptorProto
@@ -147,7 +147,7 @@ def _example_type() -> Any:
 
 @dataclass(frozen=True)
 class Shard:
-    """A file of a split, with the number of episodes in it."""
+    """One file in a split, and how many episodes it holds."""
 
     file: Path
     split: str
@@ -156,13 +156,13 @@ class Shard:
 
 @dataclass(frozen=True)
 class RldsInfo:
-    """What the metadata tell.
+    """What the metadata say.
 
     source: name and version
-    shards: in the order of the splits
-    cameras: features of pictures with 8-bit colours, by the names below ``steps/observation``
+    shards: in split order
+    cameras: 8-bit colour picture features, by name below ``steps/observation``
     left_out: other pictures there, with the reason
-    instructions: features with the task, of each step or of the episode, best first
+    instructions: features that hold the task, per step or per episode, best first
     notes: lines for the caller
     """
 
@@ -175,7 +175,7 @@ class RldsInfo:
 
     @classmethod
     def read(cls, root: Path, task_column: str | None = None) -> RldsInfo:
-        """Return the information in ``root``. Raises DatasetError.
+        """Read the metadata in ``root``. Raises DatasetError.
 
         task_column: feature with the task, or the last part of its path; None: those in ``INSTRUCTIONS``
         """
@@ -265,7 +265,7 @@ def _leaves(feature: Any, name: str = "") -> Iterator[tuple[str, Mapping[str, An
 
 
 def _shown(name: str, feature: Mapping[str, Any]) -> bool:
-    """True for an observation that may be a picture."""
+    """True if the observation may be a picture."""
     shape = _shape(feature.get("tensor", {}))
     is_array = len(shape) in (2, 3) and all(size >= LEAST_SIZE_PX for size in shape[:2])
     return name.startswith(_OBSERVATION) and ("image" in feature or "video" in feature or is_array)
@@ -276,7 +276,7 @@ def _shape(value: Mapping[str, Any]) -> list[int]:
 
 
 def _fault(feature: Mapping[str, Any]) -> str:
-    """Why a feature is no camera; empty: it is one."""
+    """Why a feature is no camera; empty if it is one."""
     if "image" not in feature:
         return "an array or a video: expected a JPEG or PNG file for each step"
     image = feature["image"]
@@ -286,7 +286,7 @@ def _fault(feature: Mapping[str, Any]) -> str:
 
 
 def _rank(name: str) -> tuple[int, ...]:
-    """Sorts features with instructions, best first; empty for another feature."""
+    """Sort key that puts the best instruction first; empty for other features."""
     match = _INSTRUCTION.fullmatch(name.split("/")[-1])
     if match is None:
         return ()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Files of frames in datasets: what identifies them, and their faults with the place. H x W pixels."""
+"""Stored frames: how to identify their files, and how to report faults with the place. H x W pixels."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _DIGESTS_AT_A_TIME = 2**16
 
 
 def digest_of(parts: Iterable[bytes]) -> str:
-    """Return a digest of the parts and of the bounds between them."""
+    """Hash the parts, including where one ends and the next begins."""
     digest = hashlib.blake2b(digest_size=16)
     for part in parts:
         digest.update(len(part).to_bytes(8, "little"))
@@ -33,9 +33,9 @@ def digest_of(parts: Iterable[bytes]) -> str:
 
 
 def file_identity(file: Path, *, verify: bool, revision: str | None = None) -> str:
-    """Return a text that identifies a file: its size and modification time, or with ``verify`` its SHA-256.
+    """Return a text that identifies a file: size and modification time, or SHA-256 with ``verify``.
 
-    revision: commit on the Hub; replaces the time, which differs on every machine
+    revision: commit on the Hub; replaces the time, which differs between machines
 
     Raises DatasetError.
     """
@@ -60,14 +60,14 @@ def _sha256(file: Path, _size: int, _changed_ns: int) -> str:
 
 
 def turn_mark(picture: bytes | Path) -> str:
-    """Return a text for ``Dataset.identity`` if EXIF data turn a picture, as earlier labels did not; else ""."""
+    """Return a mark for ``Dataset.identity`` if EXIF data turn a picture, which earlier labels ignored; else ""."""
     turn = Picture(picture).exif_turn
     return "" if turn is None else f" EXIF {turn}"
 
 
 @contextmanager
 def faults_at(where: object) -> Iterator[None]:
-    """Raise the block's FrameFileError as DatasetError at this place."""
+    """Turn a FrameFileError in the block into a DatasetError at this place."""
     try:
         yield
     except FrameFileError as error:
@@ -77,7 +77,7 @@ def faults_at(where: object) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """The frames of one episode in a video, T of them.
+    """One episode's T frames in a video.
 
     times_s: float64 [T], rising time stamps in the video
     tolerance_s: half the time between frames
@@ -95,5 +95,5 @@ class Span:
             yield from self.video.frames_at(self.times_s, self.tolerance_s)
 
     def error(self, expected: str, got: object) -> DatasetError:
-        """Return the error of this span's video."""
+        """Return an error that names this span's video."""
         return DatasetError.at(f"{self.where}: {self.video.file}", expected, got)
