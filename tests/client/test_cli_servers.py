@@ -273,6 +273,7 @@ def test_a_server_that_goes_away_is_not_asked_any_more(engines: EngineServer, tm
     embeddings = {"video_embeddings": random.random((8, 64)), "text_embedding": random.random(32)}
     np.savez(source, **{name: array.astype(np.float32) for name, array in embeddings.items()})
     with ExitStack() as proxies:
+        proxies.enter_context(engines.client("rfm")).model_info()  # loaded before the timeout counts
         proxy = proxies.enter_context(Proxy(int(engines.url.rpartition(":")[2])))
         url = f"grpc://127.0.0.1:{proxy.port}"
         words = ("score", *[source] * NUM_SOURCES, "--timeout", 1, "--json", target, "--url", url)

@@ -42,6 +42,7 @@ def test_the_guide_s_commands_tell_the_trained_checkpoint_from_the_early_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")  # as the guide shows the table
     for name in ("model_repository", "examples"):
         (tmp_path / name).symlink_to(ROOT / name)
     guide = GUIDE.read_text()
