@@ -74,7 +74,7 @@ def file_name(file: Path, folder: Path) -> str:
     return os.path.relpath(file, folder if file.is_relative_to(folder) else folder.resolve())
 
 
-def told(assumptions: Sequence[Assumption]) -> list[str]:
+def assumption_lines(assumptions: Sequence[Assumption]) -> list[str]:
     """Return one line for the user about all assumptions, or an empty list."""
     listed = "; ".join(each.text for each in assumptions)
     line = f"assumed, and not shown by the checkpoint: {listed}; scores differ from the run's if it had others"

@@ -229,8 +229,8 @@ def _published(folder: Path, content: dict[str, Any], options: CheckpointConfig)
     file = folder / NETWORK_CONFIG
     read = Settings.read(folder, content)
     fields = read.fields()
-    told = {name: value for name, value in content.items() if name not in PUBLISHED and "value_token_id" not in name}
-    backbone = backbone_config({**told, "model_type": QWEN3}, file)
+    rest = {name: value for name, value in content.items() if name not in PUBLISHED and "value_token_id" not in name}
+    backbone = backbone_config({**rest, "model_type": QWEN3}, file)
     tensors, _ = read_published(folder, read_unrounded_config(backbone, file), MODEL_TYPE)
     weights = {name: each for name, each in renamed(tensors, QWEN_NAMES).items() if not UNUSED.fullmatch(name)}
     _set_rows(backbone, weights, file)

@@ -139,9 +139,9 @@ class RepositoryApi:
                 got = "another" if self._headers else "none"
                 expected = f"that of the server at {self._url} (--admin-key-file or {VARIABLE})"
                 raise RepositoryApiError.at("admin key", expected, got) from None
-            told = triton.error_from(error, self._url)
-            if isinstance(told, ServerUnavailableError) and told.remedy and message not in str(told):  # no connection
-                raise RepositoryApiError(str(told)) from error
+            ours = triton.error_from(error, self._url)
+            if isinstance(ours, ServerUnavailableError) and ours.remedy and message not in str(ours):  # no connection
+                raise RepositoryApiError(str(ours)) from error
             is_server_s = str(error.status()) in _OF_SERVER
             raise RepositoryApiError(f"{self._url}: {message}" if is_server_s else message) from error
 

@@ -324,8 +324,8 @@ def warning_of(samples: Sequence[Sample]) -> str:
     padded = dict.fromkeys(index for index, frames, found in clips if not found.told and _is_padded(frames))
     warnings = []
     if blank:
-        told = max(blank.values(), key=lambda found: found.highest or 0).told
-        warnings.append(f"samples {first_names(blank, MOST_NAMES)}: {told}: their scores mean nothing")
+        described = max(blank.values(), key=lambda found: found.highest or 0).told
+        warnings.append(f"samples {first_names(blank, MOST_NAMES)}: {described}: their scores mean nothing")
     if padded:
         warnings.append(f"samples {first_names(padded, MOST_NAMES)}: {PADDING}: they are scored as pictures")
     return "; ".join(warnings)
@@ -335,9 +335,9 @@ def refuse_blank_frames(trajectory: Trajectory) -> None:
     """Raise InvalidSampleError for blank frames, and for zero frames at the end."""
     if trajectory.frames is None:
         return
-    told = BlankFrames(trajectory.frames).told or PADDING * _is_padded(trajectory.frames)
-    if told:
-        raise InvalidSampleError.at("frames", "pictures that show something", told)
+    fault = BlankFrames(trajectory.frames).told or PADDING * _is_padded(trajectory.frames)
+    if fault:
+        raise InvalidSampleError.at("frames", "pictures that show something", fault)
 
 
 def _is_padded(frames: UInt8Array) -> bool:

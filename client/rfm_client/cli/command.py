@@ -16,7 +16,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.models import OptionInfo
 
-from rfm_client.cli.messages import UsageError, argument_name, in_plain_words, told, write_options
+from rfm_client.cli.messages import UsageError, argument_name, in_plain_words, user_message, write_options
 from rfm_client.contract import errors
 from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, placeholder_of
 
@@ -141,7 +141,7 @@ class Command(TyperCommand):
             code, lines = ExitCode.FAILED, [missing_package(error)]
         except (errors.LocatedError, errors.RewardError, OSError) as error:
             code = exit_code(error) if self.has_codes else ExitCode.FAILED
-            lines = told(error).split("\n")
+            lines = user_message(error).split("\n")
         for line in lines:
             report(line, self.program)
         raise typer.Exit(code)

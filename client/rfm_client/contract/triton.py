@@ -196,8 +196,8 @@ def denied(url: str, status: str, message: str) -> errors.AccessDeniedError:
 
 def unreachable(url: str, reason: str, proxy: str | None = None) -> errors.ServerUnavailableError:
     """Return the error for a failed connection to the server or its proxy."""
-    told = _REASON.search(reason)
-    reason = told[1] if told else reason
+    found = _REASON.search(reason)
+    reason = found[1] if found else reason
     if proxy is None:
         return _with_remedy(errors.ServerUnavailableError, f"{url}: no connection: {reason}", _START)
     fault = f"{url}: no connection through {proxy}: {reason}"

@@ -165,8 +165,8 @@ class Servers:
         if len(self._servers) > 1:
             others = [server.transport for server in self._servers if not server.is_left_out]
             left_s = deadline.remaining_s()
-            told = await asyncio.gather(*(each.model_info(model, left_s) for each in others), return_exceptions=True)
-            for outcome in told:
+            replies = await asyncio.gather(*(each.model_info(model, left_s) for each in others), return_exceptions=True)
+            for outcome in replies:
                 if isinstance(outcome, ModelInfo):
                     infos.append(outcome)
                 elif not isinstance(outcome, RewardError):

@@ -46,7 +46,7 @@ _MS_PER_S = 1e3
 _US_PER_S = 1e6
 
 _Version: TypeAlias = tuple[str, str]  # a model's name and version
-_Told: TypeAlias = tuple[  # version, readiness, and every model's index entry and statistics
+_ServerState: TypeAlias = tuple[  # version, readiness, and every model's index entry and statistics
     str, bool, dict[_Version, tuple[Mapping[str, Any], Mapping[str, Any]]]
 ]
 
@@ -209,11 +209,11 @@ class _Metrics:
     error: str | None = None
 
 
-async def _state(url: str, timeout_s: float, credentials: Credentials | None) -> _Told:
+async def _state(url: str, timeout_s: float, credentials: Credentials | None) -> _ServerState:
     """Return the server's version, whether it is ready, and every model's index entry and statistics."""
     transport = connect(url, credentials=credentials)
 
-    async def request(client: Any) -> _Told:
+    async def request(client: Any) -> _ServerState:
         version = (await client.get_server_metadata(**transport.as_json))["version"]
         statistics = (await client.get_inference_statistics(**transport.as_json)).get("model_stats", [])
         try:

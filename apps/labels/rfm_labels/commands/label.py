@@ -262,8 +262,8 @@ class LabelCommand:
                 unused.append(error)
                 command = replace(command, texts=replace(command.texts, task=None))
             except RewardError as error:
-                told = error.lines if isinstance(error, FaultsError) else [str(error)]
-                lines += [line if command.source in line else f"{command.source}: {line}" for line in told]
+                messages = error.lines if isinstance(error, FaultsError) else [str(error)]
+                lines += [line if command.source in line else f"{command.source}: {line}" for line in messages]
             checked.append(command)
         if lines:
             raise FaultsError.listing(lines)

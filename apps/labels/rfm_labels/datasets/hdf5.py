@@ -139,9 +139,9 @@ class Hdf5Dataset(Dataset):
             notes.append(
                 "left out: each first picture, which shows the end of the episode before; frame 0 is the second"
             )
-        told = instructions_of(self.file) if self._layout is ROBOTWIN else []
-        if told and self._tasks[0] == told[0] and self.given_task.text is None:
-            notes.append(f"task: the first of {len(told)} sentences in instructions/{self.file.stem}.json")
+        instructions = instructions_of(self.file) if self._layout is ROBOTWIN else []
+        if instructions and self._tasks[0] == instructions[0] and self.given_task.text is None:
+            notes.append(f"task: the first of {len(instructions)} sentences in instructions/{self.file.stem}.json")
         return notes
 
     def _notes_on_colours(self, asked: AskedCorrections, unmarked: Sequence[str]) -> list[str]:
@@ -156,8 +156,8 @@ class Hdf5Dataset(Dataset):
 
     def read_episode(self, number: int) -> DatasetEpisode:
         where = f"{self.file}: {self._layout.group_of(self._demos[number])}".removesuffix(": ")
-        told = " or ".join(name + " (no JSON object)" * (name in self._broken) for name in DOCUMENTS)
-        places = f"ep_meta, or data: {told}" if self._layout.is_in_data else task_places(self.file)
+        documents = " or ".join(name + " (no JSON object)" * (name in self._broken) for name in DOCUMENTS)
+        places = f"ep_meta, or data: {documents}" if self._layout.is_in_data else task_places(self.file)
         task = self.given_task.of(f"{where}: {places}", self._tasks[number])
         lengths = self._lengths[number]
         got = ", ".join(f"{key} {length}" for key, length in lengths.items()) or self._forms[number]
@@ -188,8 +188,8 @@ class Hdf5Dataset(Dataset):
 
     def _shared(self, numbers: Sequence[int]) -> tuple[Sequence[str], Mapping[str, str]]:
         """The cameras that all these demonstrations share, and what is wrong with other pictures."""
-        told = {name: [faults[number] for number in numbers] for name, faults in self._pictures.items()}
-        faults = {name: next(filter(None, of_demos), "") for name, of_demos in told.items()}
+        chosen = {name: [faults[number] for number in numbers] for name, faults in self._pictures.items()}
+        faults = {name: next(filter(None, of_demos), "") for name, of_demos in chosen.items()}
         cameras = tuple(name for name, fault in faults.items() if not fault)
         return cameras, {name: fault for name, fault in faults.items() if fault}
 

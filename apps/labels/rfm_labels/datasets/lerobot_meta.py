@@ -116,8 +116,8 @@ class Info:
 
 
 def _is_depth(feature: Mapping[str, Any]) -> bool:
-    told = [feature[name] for name in _OF_PICTURES if isinstance(feature.get(name), dict)]
-    return any(each.get(mark) is True for each in told for mark in _DEPTH_MARKS)
+    infos = [feature[name] for name in _OF_PICTURES if isinstance(feature.get(name), dict)]
+    return any(each.get(mark) is True for each in infos for mark in _DEPTH_MARKS)
 
 
 def _no_colours(feature: Mapping[str, Any]) -> str:

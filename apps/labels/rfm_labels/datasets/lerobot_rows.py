@@ -220,11 +220,11 @@ def values_in(where: str, column: Any, own: npt.NDArray[np.int64], times_s: npt.
     if isinstance(column, np.ndarray):
         return column[own]
     stored: Sequence[Mapping[str, Any]] = column[int(own[0])].as_py() or []  # the same in all rows of an episode
-    told = {row["timestamp"]: row["content"] for row in stored if row["style"] == _STYLE}
-    is_one = all(told[row["timestamp"]] == row["content"] for row in stored if row["style"] == _STYLE)
+    content_at = {row["timestamp"]: row["content"] for row in stored if row["style"] == _STYLE}
+    is_one = all(content_at[row["timestamp"]] == row["content"] for row in stored if row["style"] == _STYLE)
     require(where, is_one, f"one {_STYLE} at a time", "several")
-    starts_s = sorted(told)
-    contents = [None, *(told[start_s] for start_s in starts_s)]
+    starts_s = sorted(content_at)
+    contents = [None, *(content_at[start_s] for start_s in starts_s)]
     return np.array([contents[k] for k in np.searchsorted(starts_s, times_s, side="right")], dtype=object)
 
 
