@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from rfm.config import CheckpointConfig
-from rfm_client.cli.command import Given, with_options
+from rfm_client.cli.command import OptionValues, with_options
 from rfm_client.contract.settings import setting
 from rfm_commands.command import say
 from rfm_labels import LabelOptions, RayOptions, Scorer
@@ -30,7 +30,7 @@ class LabellingCheckpoint(CheckpointConfig):
 @with_options
 def label(
     dataset: DatasetArgument,
-    given: Given[LabellingCheckpoint],
+    given: OptionValues[LabellingCheckpoint],
     texts: EpisodeTexts,
     labels: LabelOptions,
     run: RunOptions,

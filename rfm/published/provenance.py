@@ -13,7 +13,7 @@ from typing import Any
 
 from rfm.files import MODEL_CARD, PROVENANCE, is_there, network_config
 
-OF_UPSTREAM = "default of upstream"
+UPSTREAM_DEFAULT = "default of upstream"
 _CARD_LICENSE = re.compile(r"\A---\n(?:.*\n)*?license: *(\S+) *\n")
 _NAMED_PARTS = 2  # path parts to show; the rest may be private
 HUB_FOLDER = "models--"  # prefix of a repository's folder name in the Hub's cache

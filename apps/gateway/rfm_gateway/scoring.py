@@ -42,7 +42,7 @@ from rfm_gateway.observe import within
 from rfm_gateway.state import ServedParts
 
 FRAME_STEPS = 4  # the evaluation server samples each prefix to this many frames
-FRAME_STEPS_OF_SECONDS = 8  # the same, for a model that predicts remaining seconds
+FRAME_STEPS_FOR_SECONDS = 8  # the same, for a model that predicts remaining seconds
 PREFERRED = 0.5
 CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the chosen trajectory is first, and better
 WARNING_HEADER = "X-RFM-Warning"  # on responses whose scores mean nothing
@@ -243,7 +243,7 @@ class _Conversion:
 
 
 def _frame_steps(frames: ModelInfo | None) -> int:
-    return FRAME_STEPS if frames is None or frames.has_progress else FRAME_STEPS_OF_SECONDS
+    return FRAME_STEPS if frames is None or frames.has_progress else FRAME_STEPS_FOR_SECONDS
 
 
 def _prefixes(sample: Sample) -> list[Sample]:

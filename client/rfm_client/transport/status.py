@@ -22,7 +22,7 @@ from rfm_client.contract.addresses import open_url, split_url
 from rfm_client.contract.errors import DeadlineExceededError, ServerUnavailableError
 from rfm_client.contract.wire import encoder_name, frames_name
 from rfm_client.transport.calls import connect
-from rfm_client.transport.connection import OF_A_PORT, Credentials, wrong_port
+from rfm_client.transport.connection import WRONG_PORT_ERRORS, Credentials, wrong_port
 
 METRICS_PORT = 8002
 METRICS_OPTION = "--metrics-url"
@@ -185,7 +185,7 @@ class ServerStatus:
             version, is_ready, models = asyncio.run(_state(url, timeout_s, credentials))
         except DeadlineExceededError as late:
             raise DeadlineExceededError(f"{late.server}: no answer within {timeout_s:g} s") from late
-        except OF_A_PORT as error:
+        except WRONG_PORT_ERRORS as error:
             if named := wrong_port(url):
                 raise ServerUnavailableError(named) from error
             raise

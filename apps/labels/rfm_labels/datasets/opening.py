@@ -69,7 +69,7 @@ _KINDS: dict[str, tuple[type[EpisodeFiles], str]] = {  # reader, and what an epi
     "recordings of Unitree": (UnitreeFolders, "folder"),
 }
 _OWN_TASKS = ("arrays", "recordings of Unitree")
-_FILES_OF_OURS = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside labelled episodes; HDF5: from 0.4
+_OUR_FILES = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside labelled episodes; HDF5: from 0.4
 
 
 def read_table_of_tasks(table: Path, *, has_tasks: bool) -> Mapping[str, str | None]:
@@ -227,7 +227,7 @@ def hdf5_files(folder: str | Path) -> list[Path]:
     if not root.is_dir() or is_other or set(_found(root)) - {"HDF5 files"}:
         return []
     names = (str(file.relative_to(root)) for file in root.rglob("*") if file.suffix.lower() in SUFFIXES)
-    shown = [name for name in names if "/." not in f"/{name}" and not _FILES_OF_OURS.fullmatch(name)]
+    shown = [name for name in names if "/." not in f"/{name}" and not _OUR_FILES.fullmatch(name)]
     return [root / name for name in in_natural_order(shown)]
 
 
@@ -289,7 +289,7 @@ def _listed(folder: Path) -> tuple[str, list[str]]:
 def _found(folder: Path) -> dict[str, list[str]]:
     """Names that may be episodes, by kind, without hidden files and label files."""
     shown = [folder / name for name in _names_in(folder)]
-    files = [each for each in shown if each.is_file() and not _FILES_OF_OURS.fullmatch(each.name)]
+    files = [each for each in shown if each.is_file() and not _OUR_FILES.fullmatch(each.name)]
     folders = [each for each in shown if each.is_dir() and each.name != SIGNALS_FOLDER]
     found = {
         kind: [each.name for each in files if each.suffix.lower() in suffixes]
@@ -306,7 +306,7 @@ def _found(folder: Path) -> dict[str, list[str]]:
 
 
 def _is_frame(file: Path) -> bool:
-    return is_picture(file) and not _FILES_OF_OURS.fullmatch(file.name)
+    return is_picture(file) and not _OUR_FILES.fullmatch(file.name)
 
 
 def _names_in(folder: Path) -> list[str]:
