@@ -167,8 +167,8 @@ class RldsDataset(Dataset):
     def _instruction(self, features: Mapping[str, Any]) -> str:
         """The first feature with a non-blank instruction; else the first feature, or none."""
         known = self._info.instructions
-        said = (name for name in known if any(not is_blank(_shown(text)) for text in self._values(features, name)))
-        return next(said, known[0] if known else "")
+        filled = (name for name in known if any(not is_blank(_shown(text)) for text in self._values(features, name)))
+        return next(filled, known[0] if known else "")
 
     def _tasks(self, number: int, record: _Record) -> list[tuple[int, str]]:
         """First frame and task for each stretch with one task. Raises DatasetError."""
