@@ -28,7 +28,7 @@ DEFAULT_HOST = "127.0.0.1"
 DEFAULT_TOKEN_BUDGET = 16_384
 DEFAULT_SAMPLE_TOKENS = 131_072
 DEFAULT_FEATURE_CACHE_MB = 256  # 80,000 embeddings with 768 numbers, or 170 frames at 256x256 for a 4B Qwen3-VL
-MAX_OF_A_MACHINE = 4096  # GPUs, instances, threads
+MAX_PER_MACHINE = 4096  # GPUs, instances, threads
 MAX_INT32 = 2**31 - 1
 MAX_NAME = 100  # characters; a model's name becomes a folder name
 Dtype: TypeAlias = Literal["float32", "bfloat16", "float16"]
@@ -37,7 +37,7 @@ Weights: TypeAlias = Literal["int8", "nf4"]
 
 _COUNT = {"least": 1, "most": MAX_INT32}
 _PORT = {"least": 1, "most": MAX_PORT}
-_OF_A_MACHINE = {"most": MAX_OF_A_MACHINE}
+_PER_MACHINE = {"most": MAX_PER_MACHINE}
 _OR_MOVED = ", or 20 more while another setting names that port."
 
 
@@ -94,16 +94,16 @@ class ExportConfig(CheckpointConfig):
 
     name: str = setting(DEFAULT_MODEL, "Model name in the repository. NAME_frames scores raw frames.")
     num_gpus: int | None = setting(
-        None, "Number of GPUs; 0 means the CPU. Default: all GPUs, or the CPU.", least=0, **_OF_A_MACHINE
+        None, "Number of GPUs; 0 means the CPU. Default: all GPUs, or the CPU.", least=0, **_PER_MACHINE
     )
     instances: int | None = setting(
         None,
         "Instances of each model per GPU, or on the CPU. Default: 2 per GPU for models of embeddings, else 1.",
         least=1,
-        **_OF_A_MACHINE,
+        **_PER_MACHINE,
     )
     torch_threads: int = setting(
-        0, "CPU threads per instance; 0 divides the cores among the instances.", least=0, **_OF_A_MACHINE
+        0, "CPU threads per instance; 0 divides the cores among the instances.", least=0, **_PER_MACHINE
     )
     max_batch_size: int | None = setting(
         None, "Largest batch, over all callers. Default: enough to saturate a GPU, at most 64.", **_COUNT
@@ -157,7 +157,7 @@ class ServeConfig(Settings):
     metrics_port: int | None = setting(None, f"Port of Triton's metrics; else 8002{_OR_MOVED}", **_PORT)
     status_port: int | None = setting(None, "Port of /live, /ready and /metrics of rfm serve.", **_PORT)
     http_threads: int | None = setting(
-        None, "Threads for HTTP requests. Default: Triton's choice.", least=1, **_OF_A_MACHINE
+        None, "Threads for HTTP requests. Default: Triton's choice.", least=1, **_PER_MACHINE
     )
     probe_s: int = setting(2, "Seconds between two probes of a model.", **_COUNT)
     hang_s: int = setting(

@@ -257,13 +257,13 @@ def weights_digest(folders: Iterable[Path]) -> str:
     return digest.hexdigest()[:DIGEST_DIGITS]
 
 
-def settings_digest(folders: Iterable[Path], told: Mapping[str, Any]) -> str:
+def settings_digest(folders: Iterable[Path], settings: Mapping[str, Any]) -> str:
     """Return the first DIGEST_DIGITS of the SHA-256 over all settings that decide scores. Raises OSError.
 
     folders: all files in them with SETTINGS_SUFFIXES count, with their paths, except PROVENANCE
-    told: settings that no file holds, as JSON values
+    settings: settings that no file holds, as JSON values
     """
-    digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for folder in folders:
         for file in sorted(file for file in folder.rglob("*") if _counts(file)):
             content = file.read_bytes()

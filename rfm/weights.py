@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 # A rounded weight has extra tensors with these endings in place of ``.weight``. A byte of NF4 holds two values.
-SCALE, DECODED, VALUES_OF_BYTE = ".scale", ".decoded", 2
+SCALE, DECODED, VALUES_PER_BYTE = ".scale", ".decoded", 2
 _MAY_BE_ZERO = re.compile(r"(progress|preference|success|similarity)_head\.|.*\.lora_[AB]\.")  # before training
 
 
@@ -23,7 +23,9 @@ def num_values(weights: Mapping[str, Tensor]) -> dict[str, int]:
     import torch  # imported here: it takes seconds
 
     counted = {name: tensor for name, tensor in weights.items() if not name.endswith((SCALE, DECODED))}
-    return {name: each.numel() * (VALUES_OF_BYTE if each.dtype is torch.uint8 else 1) for name, each in counted.items()}
+    return {
+        name: each.numel() * (VALUES_PER_BYTE if each.dtype is torch.uint8 else 1) for name, each in counted.items()
+    }
 
 
 def check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> None:

@@ -278,11 +278,11 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         Raises RewardError if no server answers.
         """
         deadline = self._deadline(timeout_s)
-        told: dict[Part, list[ModelInfo]] = {}
+        infos: dict[Part, list[ModelInfo]] = {}
         for part, name in self.model_names.items():
             with suppress(ModelNotFoundError):
-                told[part] = await self._servers.model_infos(name, deadline)
-        return told
+                infos[part] = await self._servers.model_infos(name, deadline)
+        return infos
 
     def stop_retrying(self) -> None:
         """Let later failures end their calls at once. ``close`` does this first."""

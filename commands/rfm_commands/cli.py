@@ -20,7 +20,7 @@ from rfm.serve.access import Endpoints, new_key, take_key
 from rfm.serve.installation import ServerStartError, find_installation
 from rfm.serve.supervisor import CrashLoopError, GatewayProcess, Supervisor
 from rfm.serve.triton_server import TritonServer, short_spin
-from rfm_client.cli.command import Given, add_missing, with_options
+from rfm_client.cli.command import OptionValues, add_missing, with_options
 from rfm_client.cli.messages import MOST_COLUMNS
 from rfm_client.contract.addresses import from_here
 from rfm_client.contract.process import raise_limit, write_log
@@ -80,7 +80,7 @@ def rfm(
 @app.command(cls=RfmCommand)
 @with_options
 def export(
-    given: Given[ExportConfig],
+    given: OptionValues[ExportConfig],
     repository: Annotated[Path, typer.Option(help="Triton model repository.")],
     source: Annotated[
         str | None, typer.Argument(metavar="CHECKPOINT", help="The same as --checkpoint.", show_default=False)
@@ -137,8 +137,8 @@ class ServeCommand(RfmCommand):
 @app.command(cls=ServeCommand)
 @with_options
 def serve(
-    given: Given[ServeConfig],
-    gateway_given: Given[GatewayBeside],
+    given: OptionValues[ServeConfig],
+    gateway_given: OptionValues[GatewayBeside],
     words: Annotated[
         list[str] | None,
         typer.Argument(
@@ -253,7 +253,7 @@ def _gateway_process(gateway: GatewayConfig, config: Config) -> GatewayProcess:
     return GatewayProcess(gateway_command(gateway), address, config.serve.triton_silent_s)
 
 
-def _beside(server: TritonServer, config: Config, given: Given[GatewayBeside]) -> GatewayConfig:
+def _beside(server: TritonServer, config: Config, given: OptionValues[GatewayBeside]) -> GatewayConfig:
     """Return the gateway's configuration, completed from the server's and checked: the gateway could start now."""
     gateway, endpoints = config.gateway, server.endpoints
     behind = replace(endpoints, host=from_here(endpoints.host))
@@ -276,7 +276,7 @@ def _beside(server: TritonServer, config: Config, given: Given[GatewayBeside]) -
     return filled
 
 
-def _config(file: Path | None, **options: Given[Any]) -> Config:
+def _config(file: Path | None, **options: OptionValues[Any]) -> Config:
     """Return the file's configuration with each section's given options."""
     return (Config() if file is None else Config.from_yaml(file)).with_options(**options)
 

@@ -44,13 +44,13 @@ class EngineScorer:
         on = device_named(device)
         loaded = published.read(source, **options)
         self._checkpoint, self._encoders = loaded.checkpoint, loaded.encoders()
-        told = {"device": on.type, **{name: _named(value) for name, value in options.items()}}
-        told |= {} if dtype is None else {"dtype": str(dtype)}
+        settings = {"device": on.type, **{name: _named(value) for name, value in options.items()}}
+        settings |= {} if dtype is None else {"dtype": str(dtype)}
         newer = [name for name in self._checkpoint.description.more_scores if FRAME_SCORES[name].is_newer]
-        told |= {f"marks_{name}": True for name in newer}  # as in ``ClientScorer``
+        settings |= {f"marks_{name}": True for name in newer}  # as in ``ClientScorer``
         folders = _folders(source, options)
         computed = computation(self._checkpoint, dtype, on_gpu=on.type != "cpu")
-        self._facts = replace(_facts(source, self._checkpoint, self._encoders, folders, told), computation=computed)
+        self._facts = replace(_facts(source, self._checkpoint, self._encoders, folders, settings), computation=computed)
         self.notes = published.notes(folders[0], loaded, (PROGRESS, SUCCESS))
         self._device, self._dtype = on, dtype
         self._lock = threading.Lock()
@@ -84,7 +84,7 @@ def _facts(
     checkpoint: Checkpoint,
     encoders: FrameEncoders | None,
     folders: Sequence[Path],
-    told: Mapping[str, Any],
+    settings: Mapping[str, Any],
 ) -> CheckpointFacts:
     description = checkpoint.description
     name, _, tag = source.partition("@")
@@ -94,7 +94,7 @@ def _facts(
         source="/".join(Path(source).resolve().parts[-2:]) if is_local else name,
         revision=None if is_local else tag or None,
         weights_digest=weights_digest(folders),
-        settings_digest=_settings_digest(checkpoint, encoders, folders, told),
+        settings_digest=_settings_digest(checkpoint, encoders, folders, settings),
         frame_size=description.frame_size if encoders is None else encoders.description.frame_size,
         encodes=encoders is not None,
         is_causal=getattr(checkpoint.config, "causal_mask", None) is True,
@@ -104,17 +104,17 @@ def _facts(
 
 
 def _settings_digest(
-    checkpoint: Checkpoint, encoders: FrameEncoders | None, folders: Sequence[Path], told: Mapping[str, Any]
+    checkpoint: Checkpoint, encoders: FrameEncoders | None, folders: Sequence[Path], settings: Mapping[str, Any]
 ) -> str:
     """Digest everything that decides scores except the folders' weights, including encoder weights from the Hub."""
-    told = {**told, "network": config_fields(checkpoint.config)}
+    settings = {**settings, "network": config_fields(checkpoint.config)}
     if encoders is None:
-        return settings_digest(folders, told)
+        return settings_digest(folders, settings)
     try:
         with TemporaryDirectory(prefix="rfm-label-") as written:
             encoders.save(Path(written))
-            told["encoders"] = weights_digest([Path(written)])
-            return settings_digest([*folders, Path(written)], told)
+            settings["encoders"] = weights_digest([Path(written)])
+            return settings_digest([*folders, Path(written)], settings)
     except (OSError, SafetensorError) as error:  # safetensors reports a full disk as SafetensorError
         expected = "a folder of temporary files with room for a copy of the encoders"
         raise CheckpointError.at("TMPDIR", expected, error, "name another one with it") from error

@@ -11,13 +11,13 @@ from typing import Annotated
 import typer
 
 from rfm.config import CheckpointConfig
-from rfm_client.cli.command import Given, with_options
+from rfm_client.cli.command import OptionValues, with_options
 from rfm_client.contract.settings import setting
 from rfm_commands.command import say
 from rfm_labels import LabelOptions, RayOptions, Scorer
 from rfm_labels.commands import DatasetArgument, EpisodeTexts, LabelCommand, RunOptions
 
-_ALWAYS_TOLD = ("image_encoder", "text_encoder", "base_model", "reward_model")  # in the recipe even if not given
+_ALWAYS_RECORDED = ("image_encoder", "text_encoder", "base_model", "reward_model")  # in the recipe even if not given
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class LabellingCheckpoint(CheckpointConfig):
 @with_options
 def label(
     dataset: DatasetArgument,
-    given: Given[LabellingCheckpoint],
+    given: OptionValues[LabellingCheckpoint],
     texts: EpisodeTexts,
     labels: LabelOptions,
     run: RunOptions,
@@ -44,7 +44,7 @@ def label(
     Example: rfm label my_dataset --checkpoint org/name --device cuda
     """
     checkpoint = LabellingCheckpoint(**given)
-    options = {**dict.fromkeys(_ALWAYS_TOLD), **given}
+    options = {**dict.fromkeys(_ALWAYS_RECORDED), **given}
     del options["checkpoint"]
     options.pop("dtype", None)
 

@@ -13,7 +13,7 @@ from rfm.config import CheckpointConfig, ExportConfig
 from rfm.serve.access import Endpoints
 from rfm.serve.triton_server import stopped_by_signals, temporary_server
 from rfm_client import RewardClient, Trajectory
-from rfm_client.cli.command import Given, with_options
+from rfm_client.cli.command import OptionValues, with_options
 from rfm_client.cli.options import FrameRate
 from rfm_client.cli.show import PAGE_PORT, PAGE_URL, command, next_steps, scores_table
 from rfm_client.contract.samples import UInt8Array
@@ -29,7 +29,7 @@ def try_video(
     video: Annotated[Path, typer.Argument(metavar="VIDEO", help="Video file to score.")],
     task: Annotated[str, typer.Option(help="The task, as a sentence.")],
     rate: FrameRate,
-    given: Given[CheckpointConfig],
+    given: OptionValues[CheckpointConfig],
     repository: Annotated[Path, typer.Option(help="Repository to serve, if no checkpoint is given.")] = REPOSITORY,
     output: Annotated[Path, typer.Option(help="Folder for the plot and Triton's log.")] = Path("demo_output"),
     tritonserver: TritonPath = None,
@@ -101,7 +101,7 @@ def _exported_frames(checkpoint: str, settings: ExportConfig, repository: Path) 
     return repository
 
 
-def _words(given: Given[Any]) -> list[str]:
+def _words(given: OptionValues[Any]) -> list[str]:
     """Return a checkpoint's options, as they stand on a command line."""
     words = []
     for name, value in given.items():

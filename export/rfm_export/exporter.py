@@ -23,7 +23,7 @@ from rfm_export.errors import ExportError
 from rfm_export.layout import GeneratedModel, Version, description_in, generated_files, generated_models
 from rfm_export.publish import alone, next_version, publish, read_config, staging
 from rfm_export.source import (
-    Say,
+    Printer,
     Source,
     described,
     described_encoders,
@@ -47,7 +47,7 @@ def export(
     other_machine: bool = False,
     family: str | None = None,
     device: str | None = None,
-    say: Say = _nobody,
+    say: Printer = _nobody,
 ) -> int:
     """Write the checkpoint at ``source`` into ``repository``, and return its version number.
 

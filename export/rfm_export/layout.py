@@ -173,8 +173,10 @@ def _record_digests(config: pb.ModelConfig, version: int, repository: Path) -> N
     parts = [step.model_name for step in config.ensemble_scheduling.step] or [config.name]
     folders = [repository / part / str(version) for part in parts]
     kinds = [pb.ModelInstanceGroup.Kind.Name(group.kind) for group in config.instance_group]
-    told = {"dtype": config.parameters[DTYPE_PARAMETER].string_value, "kinds": kinds} if kinds else {}
+    settings = {"dtype": config.parameters[DTYPE_PARAMETER].string_value, "kinds": kinds} if kinds else {}
     found = replace(
-        description_in(config), weights_digest=weights_digest(folders), settings_digest=settings_digest(folders, told)
+        description_in(config),
+        weights_digest=weights_digest(folders),
+        settings_digest=settings_digest(folders, settings),
     )
     config.parameters[DESCRIPTION_PARAMETER].string_value = found.to_json()

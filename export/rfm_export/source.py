@@ -40,7 +40,7 @@ from rfm_export.errors import ExportError
 from rfm_export.layout import description_in
 from rfm_export.pbtxt import parse
 
-Say: TypeAlias = Callable[[str], object]  # receives a line for the user
+Printer: TypeAlias = Callable[[str], object]  # receives a line for the user
 
 SATURATING_FLOP = 20e12  # in matrix products
 MOST_SAMPLES = 64  # small networks hardly gain from more
@@ -75,7 +75,13 @@ class Source:
 
 
 def read_for_export(
-    source: str | Path, settings: ExportConfig, family: str | None, device: str | None, say: Say, *, other_machine: bool
+    source: str | Path,
+    settings: ExportConfig,
+    family: str | None,
+    device: str | None,
+    say: Printer,
+    *,
+    other_machine: bool,
 ) -> Source:
     """Read and check all that an export needs, before it writes. Parameters and errors: see ``export``."""
     if not other_machine:
@@ -86,7 +92,7 @@ def read_for_export(
     return replace(read, settings=with_batch_size(settings, read.checkpoint, say), device=named)
 
 
-def read_source(source: str | Path, settings: ExportConfig, family: str | None, say: Say) -> Source:
+def read_source(source: str | Path, settings: ExportConfig, family: str | None, say: Printer) -> Source:
     """Read a checkpoint. Tell the user which file has the training run's settings, and about possible faults."""
     folder = published.find(source, say)
     kind = published.choose(folder, family, settings)
@@ -146,7 +152,7 @@ def num_gpus(settings: ExportConfig) -> int:
     return torch.cuda.device_count() if settings.num_gpus is None else settings.num_gpus
 
 
-def with_batch_size(settings: ExportConfig, checkpoint: Checkpoint, say: Say) -> ExportConfig:
+def with_batch_size(settings: ExportConfig, checkpoint: Checkpoint, say: Printer) -> ExportConfig:
     """Return the settings with a ``max_batch_size``: the user's, else the saturating one.
 
     say: receives a line for the user about a number below MOST_SAMPLES

@@ -30,7 +30,7 @@ from rfm_client.contract.results import answer, trajectory_scores
 from rfm_client.contract.samples import Widths, random_trajectory
 from rfm_export.errors import ExportDiffersError, ExportError
 from rfm_export.layout import Version
-from rfm_export.source import Say, Source
+from rfm_export.source import Printer, Source
 
 TOLERANCE = 1e-6  # same weights, machine and code: only rounding may differ
 GRAPHS_TOLERANCE = 1e-5  # the same kernels on the same shapes; times the largest score of a kind, at least 1
@@ -40,7 +40,7 @@ PROBE_FRAME_STEPS = 2
 WORKING_ROOM = 1.5  # times the weights' bytes, for weights and a pass over a few small samples
 
 
-def compare(source: Source, version: Version, staged: Path, say: Say) -> float | None:
+def compare(source: Source, version: Version, staged: Path, say: Printer) -> float | None:
     """Raise ExportDiffersError unless the staged weights give the checkpoint's scores.
 
     Return the largest difference that rounding the weights makes to the first score; None: nothing is rounded.
@@ -50,7 +50,7 @@ def compare(source: Source, version: Version, staged: Path, say: Say) -> float |
     return difference
 
 
-def _difference(source: Source, say: Say) -> float | None:
+def _difference(source: Source, say: Printer) -> float | None:
     """Return the largest difference that rounding the weights makes to the first score; None: nothing is rounded."""
     full = None if source.full is None else source.full()
     if full is None or full.config.weights is not None:
@@ -66,7 +66,7 @@ def _difference(source: Source, say: Say) -> float | None:
     return float(f"{largest:.2g}")
 
 
-def _compare_staged(source: Source, version: Version, staged: Path, say: Say) -> None:
+def _compare_staged(source: Source, version: Version, staged: Path, say: Printer) -> None:
     description, settings = source.checkpoint.description, source.settings
     dtype = settings.torch_dtype if description.is_large else None
     device = source.device or device_for(source.checkpoint, dtype, may_use_gpu=settings.num_gpus != 0)
@@ -188,7 +188,7 @@ def largest_difference(
     return max((float(np.nanmax(np.abs(after - before))) for before, after in of_frames), default=0.0)
 
 
-def verify_graphs(make: Callable[[], Engine], description: Description, say: Say) -> None:
+def verify_graphs(make: Callable[[], Engine], description: Description, say: Printer) -> None:
     """Raise ExportDiffersError unless CUDA graphs give the same scores as plain passes.
 
     Each sample, and another with the same shapes, is scored alone: first by plain passes, then by graphs.

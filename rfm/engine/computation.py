@@ -23,9 +23,9 @@ def computation(checkpoint: Any, dtype: torch.dtype | None, *, on_gpu: bool) -> 
     return f"{str(dtype).removeprefix('torch.')}, {_torch()}, {ATTENTION}"
 
 
-def is_by_this_torch(told: str) -> bool:
-    """Return True if ``told``, from ``computation``, names the running PyTorch version."""
-    return _torch() in told.split(", ")
+def is_by_this_torch(stated: str) -> bool:
+    """Return True if ``stated``, from ``computation``, names the running PyTorch version."""
+    return _torch() in stated.split(", ")
 
 
 def _torch() -> str:

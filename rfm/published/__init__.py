@@ -19,7 +19,7 @@ from rfm.engine.family import NETWORK, Checkpoint, Family
 from rfm.families import FAMILIES, named
 from rfm.files import WEIGHTS, CheckpointError
 from rfm.published.hub import find as find
-from rfm.published.provenance import told
+from rfm.published.provenance import assumption_lines
 from rfm.published.reader import Loaded, Reader, asked, check_used
 from rfm.published.run_config import HEADS, SIMILARITY, constant_heads, training_notes
 from rfm.weights import check_values
@@ -88,4 +88,4 @@ def notes(folder: Path, loaded: Loaded, answered: Collection[str] = HEADS) -> li
     without = [f"{WEIGHTS}: there is no head of {' and '.join(missing)}: served without"] if missing else []
     of_weights = constant_heads(loaded.checkpoint.parts[NETWORK], heads)
     of_run = training_notes(folder, heads)
-    return [*without, *of_run, *of_weights, *loaded.notes(), *told(loaded.assumptions)]
+    return [*without, *of_run, *of_weights, *loaded.notes(), *assumption_lines(loaded.assumptions)]

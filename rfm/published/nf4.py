@@ -17,7 +17,7 @@ from torch.nn.functional import pad
 
 from rfm.files import CheckpointError, shown
 from rfm.qwen.rounded import NF4_BLOCK_SIZES, NF4_CODES, of_layer
-from rfm.weights import VALUES_OF_BYTE
+from rfm.weights import VALUES_PER_BYTE
 
 _STATE = ".quant_state.bitsandbytes__nf4"  # behind a weight's name: JSON in bytes
 _MAX_STATE_BYTES = 2**16
@@ -35,7 +35,7 @@ def dequantize(tensors: dict[str, Tensor], stays: Callable[[str], bool] | None =
     names = [name.removesuffix(_STATE) for name in tensors if name.endswith(_STATE)]
     for name in names:
         state = _state(name, tensors.pop(name + _STATE))
-        is_matrix = len(state["shape"]) == 2 and state["shape"][1] % VALUES_OF_BYTE == 0
+        is_matrix = len(state["shape"]) == 2 and state["shape"][1] % VALUES_PER_BYTE == 0
         packed, scales = _parts(name, state, tensors)
         if stays is not None and is_matrix and stays(name):
             tensors |= of_layer(name, packed.view(state["shape"][0], -1), scales, _DTYPES[state["dtype"]])
@@ -90,13 +90,13 @@ def _parts(name: str, state: Mapping[str, Any], tensors: dict[str, Tensor]) -> t
         scales = scale_codes[part(".absmax", torch.uint8, blocks).int()] * outer + state["nested_offset"]
     else:
         scales = part(".absmax", torch.float32, blocks)
-    return part("", torch.uint8, (count + 1) // VALUES_OF_BYTE), scales
+    return part("", torch.uint8, (count + 1) // VALUES_PER_BYTE), scales
 
 
 def _decoded(packed: Tensor, scales: Tensor, state: Mapping[str, Any]) -> Tensor:
     """Return a weight's values, from its bytes and scales."""
     count, size, blocks = math.prod(state["shape"]), state["blocksize"], len(scales)
-    packed = pad(packed, (0, (blocks * size - count) // VALUES_OF_BYTE))
+    packed = pad(packed, (0, (blocks * size - count) // VALUES_PER_BYTE))
     codes = torch.tensor(NF4_CODES)
     pairs = torch.cartesian_prod(codes, codes)  # each byte's two values, the higher bits first
     whole = torch.empty(blocks, size, dtype=_DTYPES[state["dtype"]])

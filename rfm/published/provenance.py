@@ -13,7 +13,7 @@ from typing import Any
 
 from rfm.files import MODEL_CARD, PROVENANCE, is_there, network_config
 
-OF_UPSTREAM = "default of upstream"
+UPSTREAM_DEFAULT = "default of upstream"
 _CARD_LICENSE = re.compile(r"\A---\n(?:.*\n)*?license: *(\S+) *\n")
 _NAMED_PARTS = 2  # path parts to show; the rest may be private
 HUB_FOLDER = "models--"  # prefix of a repository's folder name in the Hub's cache
@@ -74,7 +74,7 @@ def file_name(file: Path, folder: Path) -> str:
     return os.path.relpath(file, folder if file.is_relative_to(folder) else folder.resolve())
 
 
-def told(assumptions: Sequence[Assumption]) -> list[str]:
+def assumption_lines(assumptions: Sequence[Assumption]) -> list[str]:
     """Return one line for the user about all assumptions, or an empty list."""
     listed = "; ".join(each.text for each in assumptions)
     line = f"assumed, and not shown by the checkpoint: {listed}; scores differ from the run's if it had others"

@@ -35,7 +35,7 @@ _NEEDED = {
 }
 _TIED = "tie_word_embeddings"
 # Fields that stay outside text_config, in a Qwen2.5-VL from before text_config.
-_NOT_OF_TEXT = (
+_OUTSIDE_TEXT_CONFIG = (
     "architectures", "dtype", "image_token_id", "model_type", _TIED, "torch_dtype",
     "transformers_version", "video_token_id", "vision_config", "vision_end_token_id", "vision_start_token_id",
     "vision_token_id",
@@ -89,8 +89,8 @@ def check_not_quantized(config: Mapping[str, Any], where: object, remedy: str) -
 
 def _nested(content: Mapping[str, Any]) -> dict[str, Any]:
     """Move the text model's fields into ``text_config``, as transformers does since 4.52, which copies the tie."""
-    rest = {name: value for name, value in content.items() if name in _NOT_OF_TEXT}
-    text = {name: value for name, value in content.items() if name not in _NOT_OF_TEXT or name == _TIED}
+    rest = {name: value for name, value in content.items() if name in _OUTSIDE_TEXT_CONFIG}
+    text = {name: value for name, value in content.items() if name not in _OUTSIDE_TEXT_CONFIG or name == _TIED}
     return rest | {"text_config": text | {"model_type": f"{QWEN_2_5}_text"}}
 
 

@@ -30,7 +30,7 @@ from rfm.files import (
     read_run_config,
     shown,
 )
-from rfm.published.provenance import OF_UPSTREAM, Assumption, source_name
+from rfm.published.provenance import UPSTREAM_DEFAULT, Assumption, source_name
 from rfm.published.reader import Loaded, Reader
 from rfm.published.run_config import MAX_COUNT, check_progress, find_run_config, frame_count, trained_frames
 from rfm.published.weights import has_head, read_weights, take_prefix
@@ -39,7 +39,7 @@ from rfm_client.contract.checks import require
 # Upstream's encoders, whose embeddings ReWiND checkpoints are trained on, and the known settings in their files.
 IMAGE_ENCODER = "facebook/dinov2-base"
 TEXT_ENCODER = "sentence-transformers/all-MiniLM-L12-v2"
-_OF_BOTH = ("model_type", "hidden_size", "num_hidden_layers", "num_attention_heads")
+_SHARED_FIELDS = ("model_type", "hidden_size", "num_hidden_layers", "num_attention_heads")
 _IMAGE: dict[str, Any] = {
     "model_type": "dinov2",
     "hidden_size": 768,
@@ -69,13 +69,13 @@ def image_facts(source: str) -> dict[str, Any]:
         "image_mean": list(images.mean),
         "image_std": list(images.std),
     }
-    return {name: getattr(config, name, None) for name in (*_OF_BOTH, "patch_size")} | of_images
+    return {name: getattr(config, name, None) for name in (*_SHARED_FIELDS, "patch_size")} | of_images
 
 
 def text_facts(source: str) -> dict[str, Any]:
     """Return the settings in a text encoder's files, as JSON. Raises OSError, ValueError, CheckpointError."""
     config = load_config(source, TEXT_MODELS)
-    return {name: getattr(config, name, None) for name in (*_OF_BOTH, "vocab_size")}
+    return {name: getattr(config, name, None) for name in (*_SHARED_FIELDS, "vocab_size")}
 
 
 def differences(facts: dict[str, Any]) -> list[str]:
@@ -143,7 +143,7 @@ class PretrainedEncoders:
         named = (self.image_source, self.text_source)
         encoders = zip(("image", "text"), self._sources, named, own, strict=True) if self._are_used else ()
         for kind, source, option, weights in encoders:
-            given = f"--{kind}-encoder" if option else OF_UPSTREAM
+            given = f"--{kind}-encoder" if option else UPSTREAM_DEFAULT
             whose = "weights of the checkpoint" if weights else "only its width agrees"
             found.append(Assumption(f"{kind}_encoder", source_name(source), f"{given}; {whose}"))
         return found
@@ -308,7 +308,7 @@ def _stated(folder: Path) -> tuple[dict[str, Any], tuple[Assumption, ...]]:
     assumed: tuple[Assumption, ...] = ()
     if "causal_mask" not in stated and any(content.keys() >= {*_FIRST_FIELDS} for content in sources.values()):
         stated["causal_mask"] = False
-        assumed = (Assumption("causal_mask", False, f"{OF_UPSTREAM} of before causal_mask"),)
+        assumed = (Assumption("causal_mask", False, f"{UPSTREAM_DEFAULT} of before causal_mask"),)
     # ``save`` wrote these into config.json; otherwise the run's file has them.
     frames = frame_count(saved.get("trained_frames"), f"{folder / NETWORK_CONFIG}: trained_frames")
     if frames is None and run_file is not None:

@@ -18,7 +18,7 @@ from rfm.qwen.processor import pixel_limits, read_processor
 from rfm.saved import is_saved
 
 _NAME = RoboDopamineConfig.reward_model
-_OF_USER: dict[str, type] = {"mode": str, "interval": int}  # settings that ``--as`` takes
+_USER_SETTINGS: dict[str, type] = {"mode": str, "interval": int}  # settings that ``--as`` takes
 
 
 def load(folder: Path, options: CheckpointConfig) -> Loaded:
@@ -26,7 +26,7 @@ def load(folder: Path, options: CheckpointConfig) -> Loaded:
     if options.video_prompt is not None:
         expected = "none: the prompt of this checkpoint has images"
         raise CheckpointError.at("--video-prompt", expected, options.video_prompt)
-    given = settings_asked(options, _OF_USER)
+    given = settings_asked(options, _USER_SETTINGS)
     assumptions: tuple[Assumption, ...] = ()
     if is_saved(folder):
         checkpoint = reopened(RoboDopamineCheckpoint, folder, options)

@@ -18,7 +18,7 @@ from rfm.config import CheckpointConfig
 from rfm.families.robometer.checkpoint import VlmCheckpoint, restore
 from rfm.families.robometer.collator import VlmCollator
 from rfm.families.robometer.network import VlmConfig
-from rfm.families.robometer.prompts import OF_AN_OLD_RUN
+from rfm.families.robometer.prompts import OLD_RUN_REMEDY
 from rfm.files import (
     ADAPTER_CONFIG,
     NETWORK_CONFIG,
@@ -196,7 +196,7 @@ def _config(
     if "progress_head.4.weight" not in weights:
         raise CheckpointError.at(folder, "reward heads", "no progress_head.4.weight")
     if "frame_pool_attn.weight" not in weights:
-        raise CheckpointError.at(folder, "frame_pool_attn.weight", f"none: {OF_AN_OLD_RUN}")
+        raise CheckpointError.at(folder, "frame_pool_attn.weight", f"none: {OLD_RUN_REMEDY}")
     network = run.network()
     config = VlmConfig(
         backbone=backbone,

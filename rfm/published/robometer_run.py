@@ -26,7 +26,7 @@ from rfm.files import (
     read_run_config,
     shown,
 )
-from rfm.published.provenance import OF_UPSTREAM, Assumption, file_name, source_name
+from rfm.published.provenance import UPSTREAM_DEFAULT, Assumption, file_name, source_name
 from rfm.published.qwen import Renames, renamed
 from rfm.published.run_config import find_run_config, frame_count
 from rfm.qwen.lora import MERGE
@@ -223,7 +223,7 @@ def assumptions_of(
     for name, places in SETTINGS.items():
         value = getattr(config, name)
         if name not in idle and value is not None and not any(map(run.states, places)):
-            source = f"{OF_UPSTREAM}, as {run.name} has no {run.shown(places[0])}"
+            source = f"{UPSTREAM_DEFAULT}, as {run.name} has no {run.shown(places[0])}"
             found.append(Assumption(name, value, source))
     reads_videos = config.family == QWEN_2_5 and not config.multi_image
     if reads_videos and config.backbone.get("transformers_version") is None:

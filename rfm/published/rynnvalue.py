@@ -50,11 +50,11 @@ _IDLE = {
     "hl_gauss_sigma_ratio", "bin_edges_path", "initializer_range", "model_type", "pad_token_id", "processor_class",
     "torch_dtype", "transformers_version", "use_cache",
 }  # fmt: skip
-_KEYS_OF_BACKBONE = {
+_BACKBONE_KEYS = {
     "image_token_id", "text_config", "tie_word_embeddings", "video_token_id", "vision_config", "vision_end_token_id",
     "vision_start_token_id", "quantization_config",
 }  # fmt: skip
-_OF_TOKENS = {"value_token_id", "relative_value_token_id"}
+_TOKEN_KEYS = {"value_token_id", "relative_value_token_id"}
 _COPY = "copy the file as it was published"
 
 
@@ -76,7 +76,7 @@ class Settings:
         """Return the settings from a folder with this config.json. Raises CheckpointError."""
         file = folder / PROCESSOR_CONFIG
         settings = cls(folder, content, read_json(file) if is_there(file) else {})
-        known = PUBLISHED.keys() | _IDLE | _KEYS_OF_BACKBONE | _OF_TOKENS
+        known = PUBLISHED.keys() | _IDLE | _BACKBONE_KEYS | _TOKEN_KEYS
         settings._tell_unknown(NETWORK_CONFIG, content, known)
         settings._check_style()
         return settings
@@ -205,7 +205,7 @@ def _edges(edges: Any, count: int, where: str) -> tuple[float, ...]:
 
 MODEL_TYPE = "rynn_value_lang"
 _EXAMPLE = '--robot-description "a Franka single-arm robot" --camera-description "the main right camera"'
-_OF_BACKBONE = "model."  # prefix of the backbone's weights
+_BACKBONE_PREFIX = "model."  # prefix of the backbone's weights
 
 
 def reads(folder: Path) -> bool:
@@ -229,8 +229,8 @@ def _published(folder: Path, content: dict[str, Any], options: CheckpointConfig)
     file = folder / NETWORK_CONFIG
     read = Settings.read(folder, content)
     fields = read.fields()
-    told = {name: value for name, value in content.items() if name not in PUBLISHED and "value_token_id" not in name}
-    backbone = backbone_config({**told, "model_type": QWEN3}, file)
+    rest = {name: value for name, value in content.items() if name not in PUBLISHED and "value_token_id" not in name}
+    backbone = backbone_config({**rest, "model_type": QWEN3}, file)
     tensors, _ = read_published(folder, read_unrounded_config(backbone, file), MODEL_TYPE)
     weights = {name: each for name, each in renamed(tensors, QWEN_NAMES).items() if not UNUSED.fullmatch(name)}
     _set_rows(backbone, weights, file)
@@ -264,7 +264,7 @@ def _exported(folder: Path, options: CheckpointConfig) -> Loaded:
 
 def _rounded(checkpoint: RynnCheckpoint, options: CheckpointConfig) -> RynnCheckpoint:
     """Return the checkpoint, with the backbone's layers rounded if the user asks for it, and checked."""
-    ours = {name: each for name, each in checkpoint.weights.items() if name.startswith(_OF_BACKBONE)}
+    ours = {name: each for name, each in checkpoint.weights.items() if name.startswith(_BACKBONE_PREFIX)}
     heads = {name: each for name, each in checkpoint.weights.items() if name not in ours}
     config, ours, _ = rounded_as_asked(checkpoint.config, ours, {}, options.weights)
     checkpoint = replace(checkpoint, config=config, weights={**ours, **heads})

@@ -16,8 +16,8 @@ from rfm.published.hub import find
 from rfm.published.language import LanguageFolder, reopened
 from rfm.published.reader import Loaded, Reader, asked, settings_asked
 from rfm.qwen.processor import (
-    OF_VIDEOS,
     SIZED_BY_PROCESSOR,
+    VIDEO_PREPROCESSOR,
     VIDEO_PREPROCESSOR_CONFIG,
     check_settings,
     read_preprocessor,
@@ -43,7 +43,8 @@ _DECIDING = {
     "prompt_prefix": "prompt_prefix",
     "prompt_suffix_template": "prompt_suffix",
 }
-_OF_USER = {"num_prefixes": int, "fps": float, "chat_template": bool, "max_frames": int}  # settings that ``--as`` takes
+# Settings that ``--as`` takes.
+_USER_SETTINGS = {"num_prefixes": int, "fps": float, "chat_template": bool, "max_frames": int}
 
 
 def reads(folder: Path) -> bool:
@@ -95,7 +96,7 @@ def _settings(files: LanguageFolder, of_lerobot: Mapping[str, Any], options: Che
         "prompt_suffix": PROMPT_SUFFIX,
         **_limits(files, is_lerobot=is_lerobot),
         **of_lerobot,
-        **settings_asked(options, _OF_USER),
+        **settings_asked(options, _USER_SETTINGS),
     }
     if not is_lerobot and "fps" in given:
         raise CheckpointError(f"--as: fps: expected none for {ROBOMETER}, which takes each video for 24 frames/s")
@@ -118,7 +119,7 @@ def _limits(files: LanguageFolder, *, is_lerobot: bool) -> dict[str, int]:
     """Return a video's least and most pixels according to its processor. Raises CheckpointError."""
     sampling = {} if is_lerobot else {"do_sample_frames": True}  # LeRobot says which frames are shown
     try:
-        preprocessor = read_preprocessor(files.processor, *OF_VIDEOS)
+        preprocessor = read_preprocessor(files.processor, *VIDEO_PREPROCESSOR)
     except (OSError, ValueError) as error:
         raise CheckpointError(f"base model {files.processor}: {error} (name its folder with --base-model)") from error
     size = preprocessor.get("size")

@@ -39,19 +39,21 @@ def is_at_least(version: int) -> bool:
 PROCESSOR_CONFIG = "processor_config.json"
 VIDEO_PREPROCESSOR_CONFIG = "video_preprocessor_config.json"
 # Preprocessing files, and their keys in transformers 5's PROCESSOR_CONFIG.
-OF_IMAGES, OF_VIDEOS = (PREPROCESSOR_CONFIG, "image_processor"), (VIDEO_PREPROCESSOR_CONFIG, "video_processor")
+IMAGE_PREPROCESSOR = (PREPROCESSOR_CONFIG, "image_processor")
+VIDEO_PREPROCESSOR = (VIDEO_PREPROCESSOR_CONFIG, "video_processor")
 Settings: TypeAlias = Mapping[str, Any]
 _ALL: Settings = {
     "do_rescale": True, "rescale_factor": 1 / MAX_UINT8, "do_normalize": True, "do_center_crop": False,
 }  # fmt: skip
-_OF_QWEN = {**_ALL, "do_pad": False, "merge_size": MERGE, "temporal_patch_size": FRAMES_PER_GROUP}
+_QWEN_SETTINGS = {**_ALL, "do_pad": False, "merge_size": MERGE, "temporal_patch_size": FRAMES_PER_GROUP}
 _RESIZING: Settings = {
     "do_resize": True, "resample": PIL_BICUBIC, "min_pixels": None, "max_pixels": None, "cap_pixels_per_frame": False,
     "max_video_tokens": 768, "fps": 2, "num_frames": None, "min_frames": 4, "max_frames": 768,
 }  # fmt: skip
 # Values that leave pixels as they are computed here, by the code that trained the model or runs it.
-SIZED_BEFORE: Settings = _OF_QWEN  # RFM and Robometer resize frames themselves, and turn off the processor's resizing
-SIZED_BY_PROCESSOR: Settings = {**_OF_QWEN, **_RESIZING}
+# RFM and Robometer resize frames themselves, and turn off the processor's resizing.
+SIZED_BEFORE: Settings = _QWEN_SETTINGS
+SIZED_BY_PROCESSOR: Settings = {**_QWEN_SETTINGS, **_RESIZING}
 # Settings that are read, and settings without effect on RGB frames.
 _APPLIED = {"image_mean", "image_std", "patch_size", "resample", "size"}
 _IDLE = {
@@ -76,7 +78,7 @@ def read_preprocessor(processor: str | Path, file: str, key: str) -> dict[str, A
         raise CheckpointError.at(f"{processor}: {PROCESSOR_CONFIG}: {key}", "settings", shown(nested))
     if nested is None and not found:
         if file == VIDEO_PREPROCESSOR_CONFIG:
-            return read_preprocessor(processor, *OF_IMAGES)
+            return read_preprocessor(processor, *IMAGE_PREPROCESSOR)
         raise OSError(f"expected {file}, or {key} in {PROCESSOR_CONFIG}, got none")
     inner = {name: value for name, value in (nested or {}).items() if value is not None}
     for name, value in inner.items():
@@ -183,7 +185,7 @@ def read_processor(processor: str | Path, *, videos: bool = False) -> tuple[Any,
     try:
         folder = local_copy(processor)
         tokenizer = _tokenizer(folder)
-        preprocessor = read_preprocessor(processor, *(OF_VIDEOS if videos else OF_IMAGES))
+        preprocessor = read_preprocessor(processor, *(VIDEO_PREPROCESSOR if videos else IMAGE_PREPROCESSOR))
         tokenizer.chat_template = _chat_template(folder, tokenizer)
     except (LookupError, OSError, ValueError) as error:
         hint = "name its folder with --base-model"

@@ -22,7 +22,7 @@ from torch.nn.functional import pad
 from rfm.config import Weights
 from rfm.engine.layers import linear
 from rfm.files import CheckpointError
-from rfm.weights import DECODED, SCALE, VALUES_OF_BYTE
+from rfm.weights import DECODED, SCALE, VALUES_PER_BYTE
 
 # The layers that may be rounded: linear layers in the language model and the vision tower. They hold nine tenths of a
 # network's weight bytes; the embedding, the heads and the layers between the two parts stay unrounded.
@@ -88,7 +88,7 @@ class Nf4Linear(RoundedLinear):
         count = self.out_features * self.in_features
         self._block_size = block_size(count, len(scale))
         num_blocks = math.ceil(count / self._block_size)
-        packed = self.out_features, self.in_features // VALUES_OF_BYTE
+        packed = self.out_features, self.in_features // VALUES_PER_BYTE
         self.register_buffer("weight", torch.empty(packed, dtype=torch.uint8, device="meta"))
         self.register_buffer("scale", torch.empty(num_blocks, dtype=torch.float32, device="meta"))
         self.register_buffer("decoded", torch.empty(0, dtype=decoded.dtype, device="meta"))
@@ -120,7 +120,7 @@ def is_rounded(name: str, tensor: Tensor) -> bool:
 def shape_of(weight: Tensor) -> list[int]:
     """Return the decoded shape of a weight, [N, K]."""
     rows, *columns = weight.shape
-    return [rows, columns[0] * VALUES_OF_BYTE] if weight.dtype is torch.uint8 else [rows, *columns]
+    return [rows, columns[0] * VALUES_PER_BYTE] if weight.dtype is torch.uint8 else [rows, *columns]
 
 
 def fit(network: nn.Module, weights: Mapping[str, Tensor], factors: Mapping[str, Tensor] | None = None) -> None:

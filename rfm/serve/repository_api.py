@@ -32,7 +32,7 @@ _CHANNEL = [
     ("grpc.min_reconnect_backoff_ms", 10_000),  # also limits the time to connect
     ("grpc.enable_http_proxy", 0),
 ]
-_OF_SERVER = (*triton.UNAVAILABLE, *triton.OUT_OF_TIME, *triton.CANCELLED)
+_SERVER_STATUSES = (*triton.UNAVAILABLE, *triton.OUT_OF_TIME, *triton.CANCELLED)
 _GOING = (READY, UNLOADING)
 _NOT_LOADED = "not loaded"  # this project's name for a missing state
 _UNAVAILABLE, _UNLOADED = "UNAVAILABLE", "unloaded"
@@ -139,10 +139,10 @@ class RepositoryApi:
                 got = "another" if self._headers else "none"
                 expected = f"that of the server at {self._url} (--admin-key-file or {VARIABLE})"
                 raise RepositoryApiError.at("admin key", expected, got) from None
-            told = triton.error_from(error, self._url)
-            if isinstance(told, ServerUnavailableError) and told.remedy and message not in str(told):  # no connection
-                raise RepositoryApiError(str(told)) from error
-            is_server_s = str(error.status()) in _OF_SERVER
+            ours = triton.error_from(error, self._url)
+            if isinstance(ours, ServerUnavailableError) and ours.remedy and message not in str(ours):  # no connection
+                raise RepositoryApiError(str(ours)) from error
+            is_server_s = str(error.status()) in _SERVER_STATUSES
             raise RepositoryApiError(f"{self._url}: {message}" if is_server_s else message) from error
 
     def __enter__(self) -> RepositoryApi:

@@ -30,8 +30,8 @@ class Status:
         gauge = partial(Gauge, registry=self._registry)
         self._ready = gauge("rfm_serve_ready", "1: the model is ready.", ["model"])
         self._reason = gauge("rfm_serve_not_ready", "1: the model is not ready, and why.", ["model", "reason"])
-        told = "Why Triton was started again: a model by name, or triton itself; gateway: the gateway was."
-        self.restarts = Counter("rfm_serve_restarts", told, ["what"], registry=self._registry)
+        description = "Why Triton was started again: a model by name, or triton itself; gateway: the gateway was."
+        self.restarts = Counter("rfm_serve_restarts", description, ["what"], registry=self._registry)
 
     def record(self, reasons: Mapping[str, str]) -> None:
         """Record every model's state. reasons: why each model is not ready, or NO_REASON"""
@@ -96,9 +96,9 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         code, body, content_type = HTTPStatus.OK, b"{}", "application/json"
         if self.path.partition("?")[0] == "/ready":  # 0.4.0 had /ready?strict
-            is_ready, told = self.server.status.ready
+            is_ready, document = self.server.status.ready
             code = HTTPStatus.OK if is_ready else HTTPStatus.SERVICE_UNAVAILABLE
-            body = json.dumps(told).encode()
+            body = json.dumps(document).encode()
         elif self.path == "/metrics":
             body, content_type = self.server.status.metrics(), CONTENT_TYPE_LATEST
         elif self.path != "/live":

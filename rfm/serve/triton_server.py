@@ -346,7 +346,7 @@ def _failed(problem: str, model: str) -> ServerStartError:
 
 
 def _remedy(reasons: str) -> str:
-    return next((f"; {remedy}" for said, remedy in _REMEDIES.items() if re.search(said, reasons)), "")
+    return next((f"; {remedy}" for pattern, remedy in _REMEDIES.items() if re.search(pattern, reasons)), "")
 
 
 def _names_the_same_versions(repository: Path, model: str, config: Config) -> bool:

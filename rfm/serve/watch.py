@@ -177,8 +177,8 @@ class TritonWatch:
     def _reason(self, model: str, versions: Collection[ModelVersion]) -> str:
         """Return why the model is not ready, or NO_REASON."""
         if model not in self._ready:
-            told = [entry.reason for entry in versions if entry.name == model and entry.reason]
-            return next(iter(told), "it is not loaded")
+            stated = [entry.reason for entry in versions if entry.name == model and entry.reason]
+            return next(iter(stated), "it is not loaded")
         probe = self._probes.get(model)
         if probe is not None and not probe.has_answered:
             return "it has not answered a probe yet"

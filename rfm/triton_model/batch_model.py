@@ -74,11 +74,11 @@ class BatchModel(Generic[Question, Answer]):
         )
         self._blank_tensors = probe_request(config)
         self._num_warmups = sum(warmup.get("count") or 1 for warmup in config.get("model_warmup", []))
-        told = description.computation
-        if told and not is_by_this_torch(told):
+        exported = description.computation
+        if exported and not is_by_this_torch(exported):
             here = f"torch {torch.__version__}"
             differs = "labels will name the export's computation, %s, but this is %s: export with %s"
-            logger.warning(differs, told, here, here)
+            logger.warning(differs, exported, here, here)
         if self.works_ahead:
             max_tokens = int(settings.get(BUDGET_PARAMETER) or sys.maxsize)
             self._pipeline = Pipeline(

@@ -66,7 +66,7 @@ class InstanceMetrics:
         sample_types: Collection[str],
         num_steps: Callable[[], int],
     ) -> None:
-        self._num_steps, self._num_told_steps = num_steps, num_steps()
+        self._num_steps, self._num_reported_steps = num_steps, num_steps()
         self._lock = threading.Lock()  # guards the sums below
         self._samples: Counter[tuple[str, str]] = Counter()
         self._totals: Counter[str] = Counter()
@@ -130,11 +130,12 @@ class InstanceMetrics:
             for outcome in OUTCOMES
         }
         self._total_metrics = {
-            name: self._family(name, "COUNTER", told).Metric(labels=labels) for name, told in _TOTALS.items()
+            name: self._family(name, "COUNTER", description).Metric(labels=labels)
+            for name, description in _TOTALS.items()
         }
         self._histograms = {
-            name: self._family(name, "HISTOGRAM", told).Metric(labels=labels, buckets=list(buckets))
-            for name, (told, buckets) in _HISTOGRAMS.items()
+            name: self._family(name, "HISTOGRAM", description).Metric(labels=labels, buckets=list(buckets))
+            for name, (description, buckets) in _HISTOGRAMS.items()
         }
         kept = self._family("feature_cache_bytes", "GAUGE", "Bytes of cached features.")
         self._kept_metric = kept.Metric(labels=labels)
@@ -162,7 +163,7 @@ class InstanceMetrics:
             totals, self._totals = self._totals, Counter()
             observed, self._observed = self._observed, []
         num_steps = self._num_steps()
-        totals[PASSES], self._num_told_steps = num_steps - self._num_told_steps, num_steps
+        totals[PASSES], self._num_reported_steps = num_steps - self._num_reported_steps, num_steps
         try:
             for key, count in samples.items():
                 self._sample_metrics[key].increment(count)

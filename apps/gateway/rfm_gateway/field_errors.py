@@ -36,7 +36,7 @@ _SIDES = {  # the gateway's fields, by the client's names
     "reference": "ref_trajectory",
     "other": "sim_trajectory",
 }
-_OF_SAMPLE = ("sample_type", "answer")  # fields that a model's error may name outside any trajectory
+_SAMPLE_FIELDS = ("sample_type", "answer")  # fields that a model's error may name outside any trajectory
 _FEWER_FRAMES = f"send fewer frames, such as some at equal distances, or {STEPS_FIELD}"
 _SMALLER = "send smaller or fewer frames"
 
@@ -83,7 +83,7 @@ def _placed(words: list[str], error: InvalidSampleError, sample: schema.Sample) 
     elif error.remedy and not around:  # from the client, whose remedy is an option in Python
         message = f"expected {error.expected}, got {error.got}; {_SMALLER}"
     path = [int(word) if word.isdecimal() else _SIDES.get(word, word) for word in [*around, field] if word]
-    if around or field in _OF_SAMPLE or not path:
+    if around or field in _SAMPLE_FIELDS or not path:
         return tuple(path), message
     return _of_trajectory(field, sample), message
 

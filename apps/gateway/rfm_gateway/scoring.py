@@ -42,7 +42,7 @@ from rfm_gateway.observe import within
 from rfm_gateway.state import ServedParts
 
 FRAME_STEPS = 4  # the evaluation server samples each prefix to this many frames
-FRAME_STEPS_OF_SECONDS = 8  # the same, for a model that predicts remaining seconds
+FRAME_STEPS_FOR_SECONDS = 8  # the same, for a model that predicts remaining seconds
 PREFERRED = 0.5
 CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the chosen trajectory is first, and better
 WARNING_HEADER = "X-RFM-Warning"  # on responses whose scores mean nothing
@@ -243,7 +243,7 @@ class _Conversion:
 
 
 def _frame_steps(frames: ModelInfo | None) -> int:
-    return FRAME_STEPS if frames is None or frames.has_progress else FRAME_STEPS_OF_SECONDS
+    return FRAME_STEPS if frames is None or frames.has_progress else FRAME_STEPS_FOR_SECONDS
 
 
 def _prefixes(sample: Sample) -> list[Sample]:
@@ -324,8 +324,8 @@ def warning_of(samples: Sequence[Sample]) -> str:
     padded = dict.fromkeys(index for index, frames, found in clips if not found.told and _is_padded(frames))
     warnings = []
     if blank:
-        told = max(blank.values(), key=lambda found: found.highest or 0).told
-        warnings.append(f"samples {first_names(blank, MOST_NAMES)}: {told}: their scores mean nothing")
+        described = max(blank.values(), key=lambda found: found.highest or 0).told
+        warnings.append(f"samples {first_names(blank, MOST_NAMES)}: {described}: their scores mean nothing")
     if padded:
         warnings.append(f"samples {first_names(padded, MOST_NAMES)}: {PADDING}: they are scored as pictures")
     return "; ".join(warnings)
@@ -335,9 +335,9 @@ def refuse_blank_frames(trajectory: Trajectory) -> None:
     """Raise InvalidSampleError for blank frames, and for zero frames at the end."""
     if trajectory.frames is None:
         return
-    told = BlankFrames(trajectory.frames).told or PADDING * _is_padded(trajectory.frames)
-    if told:
-        raise InvalidSampleError.at("frames", "pictures that show something", told)
+    fault = BlankFrames(trajectory.frames).told or PADDING * _is_padded(trajectory.frames)
+    if fault:
+        raise InvalidSampleError.at("frames", "pictures that show something", fault)
 
 
 def _is_padded(frames: UInt8Array) -> bool:

@@ -171,11 +171,11 @@ def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool | 
                 index: _outcome(f"outcome: {source}: episode {index}", value) for index, value in dict(rows).items()
             }
     file = dataset / EPISODES_FILE
-    told = list(json_lines(file)) if file.is_file() else []
-    if not told or source not in told[0][1]:
+    lines = list(json_lines(file)) if file.is_file() else []
+    if not lines or source not in lines[0][1]:
         known = ", ".join(columns[0])
         raise DatasetError.at("outcome", f"a CSV file, or a column of {dataset}: {known}", repr(source))
-    return {line["episode_index"]: _outcome(f"{where}: {source}", line.get(source)) for where, line in told}
+    return {line["episode_index"]: _outcome(f"{where}: {source}", line.get(source)) for where, line in lines}
 
 
 def _of_csv(file: Path) -> dict[int, bool | None]:

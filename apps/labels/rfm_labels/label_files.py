@@ -209,11 +209,11 @@ class LabelFile:
         metadata: Mapping[bytes, bytes] = {}
         with suppress(DatasetError):
             metadata = _metadata(path)
-        told = _provenance(metadata)
-        is_own = str(told.get("writer")).startswith("rfm-client") and isinstance(told.get("dataset"), dict)
+        provenance = _provenance(metadata)
+        is_own = str(provenance.get("writer")).startswith("rfm-client") and isinstance(provenance.get("dataset"), dict)
         by_number = parsed_object(metadata.get(EPISODES_KEY)) if is_own else {}
         digests = {int(number): str(digest) for number, digest in by_number.items() if number.isdecimal()}
-        return cls(path, told if is_own else {}, digests, Cost.parse(metadata.get(COST_KEY)), option)
+        return cls(path, provenance if is_own else {}, digests, Cost.parse(metadata.get(COST_KEY)), option)
 
     def check(self, plan: Plan) -> None:
         """Raise DatasetError unless the plan reproduces all labels in the file by the same recipe."""

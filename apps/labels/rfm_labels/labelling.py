@@ -86,8 +86,8 @@ def planned(dataset: Dataset, scorer: Scorer, outputs: Outputs, watch: Watch = Q
             file.check(plan)
         except DatasetError as error:
             if not options.overwrite:
-                told = f"{error.problem}: choose another {file.option}, or --overwrite"
-                raise DatasetError(told, error.where) from error
+                problem = f"{error.problem}: choose another {file.option}, or --overwrite"
+                raise DatasetError(problem, error.where) from error
             labels = f"its labels of {len(file.digests)} episodes are" if file.digests else "it is"
             watch.note(f"--overwrite: {error}; {labels} replaced")
     return plan
@@ -114,8 +114,8 @@ def put_together(
         watch.note(line)
     files = outputs.write(plan, labels, cost or outputs.earlier_cost(plan))
     for name, score in SCORES.items():
-        if name in labels.column_names and (told := score.told(labels[name].to_numpy())):
-            watch.note(f"{told}; the column {name} marks them")
+        if name in labels.column_names and (note := score.mark_note(labels[name].to_numpy())):
+            watch.note(f"{note}; the column {name} marks them")
     if outputs.progress and is_filled(labels.column_names, outputs.options.fill):
         skipped = np.isnan(labels[PROGRESS].to_numpy()).sum()
         watch.note(f"progress_sparse: filled at the {skipped} of {len(labels)} frames that the model skipped (--fill)")

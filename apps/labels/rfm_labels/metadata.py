@@ -38,8 +38,8 @@ class Cost:
     def parse(cls, text: bytes | str | None) -> Cost | None:
         """Parse the cost in a label file's metadata; None if it is missing or invalid."""
         try:
-            told = json.loads(text or b"")
-            cost = cls(int(told["frames"]), float(told["seconds"]))
+            content = json.loads(text or b"")
+            cost = cls(int(content["frames"]), float(content["seconds"]))
         except (ValueError, TypeError, KeyError, OverflowError):
             return None
         return cost if cost.frames > 0 and cost.seconds > 0 else None
@@ -73,13 +73,13 @@ def blank_from_metadata(metadata: Mapping[bytes, bytes] | None) -> BlankCameras:
 def blank_lines(blank: BlankCameras, num_episodes: int) -> list[str]:
     """Return one line per camera that is blank in any episode."""
     advice = "its scores mean nothing there; leave out the camera (--cameras) or the episodes (--episodes)"
-    told = []
+    lines = []
     for camera, highest in blank.items():
         ranges = listed(sorted(highest)).split(",")
         some = ",".join(ranges[:_MOST_LISTED]) + ",..." * (len(ranges) > _MOST_LISTED)
         which = f"{len(highest)} of {num_episodes} episodes ({some})"
-        told.append(f"{camera}: {BlankFrames.described(max(highest.values()))}, in {which}: {advice}")
-    return told
+        lines.append(f"{camera}: {BlankFrames.described(max(highest.values()))}, in {which}: {advice}")
+    return lines
 
 
 def canonical_json(document: Any) -> bytes:

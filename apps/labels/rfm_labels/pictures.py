@@ -88,9 +88,9 @@ def draw_evaluation(file: Path, comparison: LabelComparison, labels: Sequence[Pa
                 "AUROC of progress": each.by_progress and each.by_progress.auroc,
                 "AUROC of success": each.by_success and each.by_success.auroc,
             }
-            told = [f"{name} {value:.2f}" for name, value in measures.items() if value is not None]
+            measured = [f"{name} {value:.2f}" for name, value in measures.items() if value is not None]
             ax.set_title(f"{each.name}: {checkpoint}" if checkpoint else each.name)
-            ax.set_title("   ".join(told), loc="right")
+            ax.set_title("   ".join(measured), loc="right")
             ax.grid(visible=False, axis="x")
             ax.yaxis.get_major_locator().set_params(integer=True)
         axes[-1].set_xlabel("progress at the last frame")
@@ -123,6 +123,6 @@ def _head(figure: Figure, *lines: str) -> None:
 
 def _origin(labels: Path) -> tuple[str, str]:
     """Return the dataset's and the checkpoint's source; the latter is empty if unknown."""
-    told = read_provenance(labels)
-    dataset, checkpoint = ((told.get(name) or {}).get("source") for name in ("dataset", "checkpoint"))
+    provenance = read_provenance(labels)
+    dataset, checkpoint = ((provenance.get(name) or {}).get("source") for name in ("dataset", "checkpoint"))
     return dataset or labels.parent.name, checkpoint or ""

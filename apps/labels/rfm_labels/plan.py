@@ -22,8 +22,8 @@ from rfm_labels.scorer import CheckpointFacts, Scorer
 
 _RECIPE_FORMAT = 4  # increase when the same recipe gives other scores or other digests
 _OPTIONAL = ("progress_rule",)  # omit when empty: older labels have no such field
-_OF_TRAINING = {True: "as upstream's training pads shorter clips", False: "the checkpoint's training did not pad"}
-_OF_CHECKPOINT = "the most in training; if the checkpoint does not say, the most its network takes"
+_SAMPLING_REASONS = {True: "as upstream's training pads shorter clips", False: "the checkpoint's training did not pad"}
+_FRAMES_REASON = "the most in training; if the checkpoint does not say, the most its network takes"
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,8 @@ class Recipe:
             sampling = Sampling.of(rule, options.frames, checkpoint.max_frames, trained_padding=padding)
         except InvalidValueError as error:
             remedy = "leave --frames out" if rule == "all" else "name them (--frames), or show all (--sampling all)"
-            told = f"{error.problem}: {remedy}"
-            raise InvalidSampleError(told, error.where) from error
+            problem = f"{error.problem}: {remedy}"
+            raise InvalidSampleError(problem, error.where) from error
         return cls(
             checkpoint,
             cameras,
@@ -164,7 +164,7 @@ class Recipe:
             **({} if self.goal is None else {"goal": self.goal.document()}),
         }
 
-    def told(self, options: LabelOptions) -> list[str]:
+    def explanation(self, options: LabelOptions) -> list[str]:
         """Explain each decision and the reason for it, one per line."""
         lines = [f"cameras: {', '.join(self.cameras)} ({'asked for' if options.cameras else 'all but depth cameras'})"]
         lines += [f"views: {', '.join(self.views)} (shown beside it)"] if self.views else []
@@ -172,10 +172,10 @@ class Recipe:
         if self.mode == "whole":
             lines.append("mode: whole: the score of frame t may depend on later frames, unless the network is causal")
         else:
-            who = "asked for" if options.sampling else _OF_TRAINING[self.checkpoint.trained_padding]
+            who = "asked for" if options.sampling else _SAMPLING_REASONS[self.checkpoint.trained_padding]
             lines.append(f"sampling: {self.sampling.rule} ({who})")
         if self.sampling.frames is not None:
-            lines.append(f"frames: {self.sampling.frames} ({'asked for' if options.frames else _OF_CHECKPOINT})")
+            lines.append(f"frames: {self.sampling.frames} ({'asked for' if options.frames else _FRAMES_REASON})")
         return lines + [f"fuse: {self.fuse} of {len(self.cameras)} cameras"] * (len(self.cameras) > 1)
 
     def check_lengths(self, episodes: Sequence[DatasetEpisode]) -> None:
@@ -333,22 +333,22 @@ def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: 
         if "progress" in options.formats:
             own = "the scores are in the column progress"
             watch.note(f"progress_sparse: the sum of the gains in an episode's tasks, as LeRobot's RA-BC needs; {own}")
-    told = " ".join(dataset.notes)
+    notes = " ".join(dataset.notes)
     cameras, faults = dataset.cameras_in(chosen_numbers(dataset, replace(options, shard=None)))
     unused = {
         name: f"{word} by name or mark, without colours; --cameras includes it"
         for name, word in dataset.unused_cameras(cameras).items()
     }
-    turned = [f"orient: {name} {turn} (asked for)" for name, turn in recipe.orientations.items() if name not in told]
+    turned = [f"orient: {name} {turn} (asked for)" for name, turn in recipe.orientations.items() if name not in notes]
     swapped = [f"channels: {name} {order} (asked for)" for name, order in recipe.channels.items()]
     left_out = [] if options.cameras else [f"left out: {name}: {why}" for name, why in {**faults, **unused}.items()]
-    tasks = _tasks_told(dataset, episodes)
-    for line in (*recipe.told(options), *left_out, *dataset.notes, *turned, *swapped, *tasks):
+    tasks = _task_lines(dataset, episodes)
+    for line in (*recipe.explanation(options), *left_out, *dataset.notes, *turned, *swapped, *tasks):
         watch.note(line)
     return make_plan(dataset, recipe, episodes)
 
 
-def _tasks_told(dataset: Dataset, episodes: Sequence[DatasetEpisode]) -> list[str]:
+def _task_lines(dataset: Dataset, episodes: Sequence[DatasetEpisode]) -> list[str]:
     """Return a line about episodes that use the caller's task, and one about tasks that are not sentences."""
     given, lines = dataset.given_task, []
     if given.overrides:
@@ -356,10 +356,10 @@ def _tasks_told(dataset: Dataset, episodes: Sequence[DatasetEpisode]) -> list[st
     elif given.text is not None:
         num_given = sum(any(task == given.text for task, _ in episode.stretches) for episode in episodes)
         lines.append(f"tasks: {len(episodes) - num_given} episodes keep their own sentence, {num_given} get --task")
-    return lines + _identifiers_told(task for episode in episodes for task, _ in episode.stretches)
+    return lines + _identifier_lines(task for episode in episodes for task, _ in episode.stretches)
 
 
-def _identifiers_told(tasks: Iterable[str]) -> list[str]:
+def _identifier_lines(tasks: Iterable[str]) -> list[str]:
     """Return a line that lists single-word ASCII tasks, such as ``pick_place_cup``; empty if there are none."""
     known = dict.fromkeys(tasks)
     found = [task for task in known if task.isascii() and len(task.split()) == 1]

@@ -58,8 +58,8 @@ class CheckpointFacts:
 
     def document(self) -> dict[str, Any]:
         """Return the facts for the provenance."""
-        told, newer = ("source", "revision", *DECISIVE, "weights"), ("computation", "weights")
-        there = {name: value for name, value in asdict(self).items() if name in told}
+        names, newer = ("source", "revision", *DECISIVE, "weights"), ("computation", "weights")
+        there = {name: value for name, value in asdict(self).items() if name in names}
         # Older labels lack the newer fields, and episode digests depend on the provenance.
         return {name: value for name, value in there.items() if value is not None or name not in newer}
 
@@ -86,7 +86,7 @@ class ClientScorer:
     def checkpoint(self) -> CheckpointFacts:
         """Ask the servers for the facts. Raises RewardError, also if the servers have different checkpoints."""
         infos = self._client.model_infos()
-        digests: list[object] = [_digests(told) for told in infos.values()]
+        digests: list[object] = [_digests(reported) for reported in infos.values()]
         info = infos["frames"][0] if "frames" in infos else self._client.model_info(frames=True)
         # Labels with and without a newer score's column cannot be joined. The first such score was a mark.
         digests += [f"marks_{name}" for name in info.scores if FRAME_SCORES[name].is_newer]
@@ -116,7 +116,7 @@ def _digests(infos: Sequence[ModelInfo]) -> tuple[str, str | None, str | None]:
     """Return a model's name and digests. Raises InvalidSampleError if servers differ in DECISIVE fields."""
     digests = {(info.name, *(getattr(info, name) for name in DECISIVE)) for info in infos}
     if len(digests) > 1:
-        told = " and ".join(sorted(", ".join(map(str, values)) for _, *values in digests))
+        got = " and ".join(sorted(", ".join(map(str, values)) for _, *values in digests))
         expected = f"the same {', '.join(DECISIVE[:-1])} and {DECISIVE[-1]} at every server"
-        raise InvalidSampleError.at(f"model {infos[0].name}", expected, told)
+        raise InvalidSampleError.at(f"model {infos[0].name}", expected, got)
     return digests.pop()[:3]

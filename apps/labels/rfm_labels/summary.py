@@ -59,16 +59,16 @@ class Summary:
         """Return names and values for a table."""
         quantiles = np.quantile(self.final_progress, [0, 0.25, 0.5, 0.75, 1])
         names = ("lowest", "lower quarter", "median", "upper quarter", "highest")
-        told = {}
+        by_outcome = {}
         for outcome, has_it in self.outcomes.items():
             numbers = self.episodes[has_it].tolist()
             more = " ..." if len(numbers) > _MOST_LISTED else ""
-            told[outcome] = f"{len(numbers)}: {', '.join(map(str, numbers[:_MOST_LISTED]))}{more}"
+            by_outcome[outcome] = f"{len(numbers)}: {', '.join(map(str, numbers[:_MOST_LISTED]))}{more}"
         return [
             ("episodes", str(len(self.episodes))),
             ("frames", str(self.num_frames)),
             *((f"final progress: {name}", f"{value:.4f}") for name, value in zip(names, quantiles, strict=True)),
-            *((f"episodes that {outcome}", numbers) for outcome, numbers in (told or {"succeed": "-"}).items()),
+            *((f"episodes that {outcome}", numbers) for outcome, numbers in (by_outcome or {"succeed": "-"}).items()),
             ("steps on which progress falls", f"{self.backwards.mean():.1%}"),
         ]
 

@@ -86,7 +86,7 @@ def viewer_routes(host: PageHost) -> APIRouter:
 
     @router.get("/viewer/served")
     async def served() -> Response:
-        models = [_told_of(name, info) for name, info in await _infos(config)]
+        models = [_model_facts(name, info) for name, info in await _infos(config)]
         return JSONResponse({"models": models, "model": config.checkpoint})
 
     @router.post("/viewer/score", dependencies=[host.place])
@@ -163,7 +163,7 @@ async def _infos(config: GatewayConfig) -> list[tuple[str, ModelInfo]]:
     return infos
 
 
-def _told_of(name: str, info: ModelInfo) -> dict[str, Any]:
+def _model_facts(name: str, info: ModelInfo) -> dict[str, Any]:
     usual = Sampling.of(None, 1, None, trained_padding=info.trained_padding).rule
     rule = "all" if info.needs_whole_episode else usual
     about = {"name": name, "max_frames": info.max_frames, "rule": rule}

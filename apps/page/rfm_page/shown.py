@@ -231,9 +231,9 @@ class ShownDataset:
         """Return how these labels made the camera's frames upright RGB; without labels, how the dataset does now."""
         if file is None:
             return self.dataset.corrections.get(camera, Correction())
-        told = read_provenance(file)
-        orient = told.get("orientations", {}).get(camera)  # labels from version 0.1.0 have none
-        order = told.get("channels", {}).get(camera)
+        provenance = read_provenance(file)
+        orient = provenance.get("orientations", {}).get(camera)  # labels from version 0.1.0 have none
+        order = provenance.get("channels", {}).get(camera)
         is_known = orient in get_args(Orientation), order in get_args(ChannelOrder)
         return Correction(orient if is_known[0] else "none", order if is_known[1] else "rgb")
 
@@ -263,8 +263,8 @@ def _curves(labels: EpisodeLabels, num_frames: int) -> list[dict[str, Any]]:
     curves = [(None, labels.fused), *labels.cameras.items()]
     answered = np.ones(num_frames, bool)
     answered[labels.frames] = labels.is_answered
-    told = {"answered": answered.tolist()}  # False: the model skipped the frame; also True for a frame without labels
-    return [{"camera": camera, **_scores(curve, labels.frames, num_frames), **told} for camera, curve in curves]
+    marks = {"answered": answered.tolist()}  # False: the model skipped the frame; also True for a frame without labels
+    return [{"camera": camera, **_scores(curve, labels.frames, num_frames), **marks} for camera, curve in curves]
 
 
 def _scores(curve: Curve, frames: npt.NDArray[np.int64], num_frames: int) -> dict[str, Any]:

@@ -102,8 +102,8 @@ class RewardModelWrapper(gymnasium.Wrapper):
         if terminated or truncated:
             check_observes_its_end(info)
             check_renders_its_end(self._options, "info", bool(own_resets) or HAS_RESET in info)
-        said = [float(env_reward)], [bool(terminated)], [bool(truncated)]
-        (reward,), _ = self._envs.keep(lambda _: self._frame(observation), *said)
+        results = [float(env_reward)], [bool(terminated)], [bool(truncated)]
+        (reward,), _ = self._envs.keep(lambda _: self._frame(observation), *results)
         episode = self._envs.episodes[0]
         info = {**with_statistics(info, episode, has_statistics=self._has_statistics), INFO: episode.info()}
         return observation, float(reward), bool(terminated or episode.succeeded), truncated, info

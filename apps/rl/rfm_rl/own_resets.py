@@ -50,8 +50,8 @@ def copied_steps(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
     step = env.step
 
     def copied(action: Any) -> Any:
-        observation, *told = step(action)
-        return deepcopy(observation), *told
+        observation, *rest = step(action)
+        return deepcopy(observation), *rest
 
     with _replaced(env, "step", copied):
         yield

@@ -235,9 +235,9 @@ class RewardedEpisode:
     def info(self) -> Info:
         """Return the newest reward and the newest known scores, under the same keys at a reset and at a step."""
         known = self.known or StepScore(np.nan, np.nan, False, -1, np.nan)
-        told: Info = {**self._paid, "progress": known.progress, "success": known.success, "step": known.step}
-        told |= {"lag": self.steps.step - known.step, "skipped": self.num_skipped, **known.more_scores}
-        return told if self._options.success_rule is None else told | {"succeeded": self._has_succeeded}
+        scores: Info = {**self._paid, "progress": known.progress, "success": known.success, "step": known.step}
+        scores |= {"lag": self.steps.step - known.step, "skipped": self.num_skipped, **known.more_scores}
+        return scores if self._options.success_rule is None else scores | {"succeeded": self._has_succeeded}
 
 
 def refuse_relabelling(*_args: object, **_kwargs: object) -> NoReturn:
@@ -252,9 +252,9 @@ def with_statistics(info: Info, episode: RewardedEpisode, *, has_statistics: boo
 
     has_statistics: True: a Monitor inside reports ends, but does not see one by ``terminate_on_success``
     """
-    told = info.get(_STATISTICS)
-    if isinstance(told, dict) and "r" in told:
-        return {**info, _STATISTICS: {**told, **_statistics(episode)}}
+    statistics = info.get(_STATISTICS)
+    if isinstance(statistics, dict) and "r" in statistics:
+        return {**info, _STATISTICS: {**statistics, **_statistics(episode)}}
     return {**info, _STATISTICS: _statistics(episode)} if has_statistics and episode.succeeded else info
 
 

@@ -127,8 +127,8 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         with ExitStack() as stack:
             for env in self._here:
                 stack.enter_context(copied_steps(env))
-            observations, env_rewards, dones, told = self.venv.step_wait()
-        infos = [dict(info) for info in told]  # a list in one ``VecEnv``, a tuple in another
+            observations, env_rewards, dones, step_infos = self.venv.step_wait()
+        infos = [dict(info) for info in step_infos]  # a list in one ``VecEnv``, a tuple in another
         ended = np.flatnonzero(dones).tolist()
         for index in ended:
             has_reset = _FRAME not in infos[index] or HAS_RESET in infos[index]

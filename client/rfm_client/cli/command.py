@@ -16,7 +16,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.models import OptionInfo
 
-from rfm_client.cli.messages import UsageError, argument_name, in_plain_words, told, write_options
+from rfm_client.cli.messages import UsageError, argument_name, in_plain_words, user_message, write_options
 from rfm_client.contract import errors
 from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, placeholder_of
 
@@ -25,7 +25,7 @@ STANDARD_OUTPUT = "-"
 S = TypeVar("S", bound=Settings)
 
 
-class Given(dict[str, Any], Generic[S]):
+class OptionValues(dict[str, Any], Generic[S]):
     """Option values from the command line, by setting name in S."""
 
 
@@ -54,7 +54,7 @@ _ERROR_CODES: dict[type[BaseException], ExitCode] = {
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command with one option per setting in its ``Settings`` and ``Given`` parameters."""
+    """Return the command with one option per setting in its ``Settings`` and ``OptionValues`` parameters."""
     # not typing.get_type_hints, which in Python 3.10 hides a parameter's annotation if the default is None
     own = inspect.signature(command, eval_str=True).parameters.values()
     chosen = {each.name: kind for each in own if (kind := _settings_class(each.annotation)) is not None}
@@ -66,7 +66,7 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
         else:
             _set_placeholder(each.annotation)
             parameters.append(each.replace(kind=inspect.Parameter.KEYWORD_ONLY))
-    are_given = {each.name for each in own if get_origin(each.annotation) is Given}
+    are_given = {each.name for each in own if get_origin(each.annotation) is OptionValues}
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
@@ -141,7 +141,7 @@ class Command(TyperCommand):
             code, lines = ExitCode.FAILED, [missing_package(error)]
         except (errors.LocatedError, errors.RewardError, OSError) as error:
             code = exit_code(error) if self.has_codes else ExitCode.FAILED
-            lines = told(error).split("\n")
+            lines = user_message(error).split("\n")
         for line in lines:
             report(line, self.program)
         raise typer.Exit(code)
@@ -233,8 +233,8 @@ def _named(error: ConfigError, options: Mapping[str, str]) -> Exception:
 
 
 def _settings_class(hint: Any) -> type[Settings] | None:
-    """Return the Settings class behind a parameter, plain or as ``Given``; None for any other parameter."""
-    (kind,) = get_args(hint) if get_origin(hint) is Given else (hint,)
+    """Return the Settings class behind a parameter, plain or as ``OptionValues``; None for any other parameter."""
+    (kind,) = get_args(hint) if get_origin(hint) is OptionValues else (hint,)
     return kind if isinstance(kind, type) and issubclass(kind, Settings) else None
 
 
@@ -275,9 +275,9 @@ def _help(setting: Setting) -> str:
     return f"{setting.help}  [{'; '.join(facts)}]" if facts else setting.help
 
 
-def _given(options: Sequence[Setting], values: dict[str, Any]) -> Given[Any]:
+def _given(options: Sequence[Setting], values: dict[str, Any]) -> OptionValues[Any]:
     """Remove the options from ``values``, and return the given settings. Raises typer.BadParameter."""
-    given = Given[Any]()
+    given = OptionValues[Any]()
     for each in options:
         value = values.pop(_key(each))
         if value in (None, []):

@@ -108,8 +108,8 @@ def score(
             return
         result = outcome.result
         _report_subsampled(outcome.name, len(result.progress), outcome.num_frames)
-        for told in filter(None, (FRAME_SCORES[name].told(each) for name, each in result.arrays.items())):
-            report(f"note: {outcome.name}: {told}")
+        for note in filter(None, (FRAME_SCORES[name].mark_note(each) for name, each in result.arrays.items())):
+            report(f"note: {outcome.name}: {note}")
         if output.prints_tables:
             rows.write(outcome.row)
 

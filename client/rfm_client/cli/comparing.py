@@ -65,8 +65,8 @@ class Comparison:
     def ranks(self) -> list[int | None]:
         """Each source's rank by ``wins``, from 1; None if a pair with this source has no verdict."""
         best_first = sorted(self._numbers, key=self.wins.__getitem__, reverse=True)
-        untold = {index for couple in self.couples() if self.pair(*couple).verdict is None for index in couple}
-        return [None if index in untold else best_first.index(index) + 1 for index in self._numbers]
+        unranked = {index for couple in self.couples() if self.pair(*couple).verdict is None for index in couple}
+        return [None if index in unranked else best_first.index(index) + 1 for index in self._numbers]
 
     @property
     def ranking(self) -> list[int] | None:

@@ -111,11 +111,11 @@ def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, colum
     width_in = WIDTH_IN if columns == 1 else COLUMN_WIDTH_IN
     layouts = [[_Layout.of(panel, width_in) for panel in row] for row in rows]
     heights_in = [max(layout.height_in for layout in row) for row in layouts]
-    told = [] if title is None else _wrapped(title, width_in * columns - _LEFT)
-    top_in = 0.1 + (_HEADLINE * len(told) + 0.04 if told else 0)
+    lines = [] if title is None else _wrapped(title, width_in * columns - _LEFT)
+    top_in = 0.1 + (_HEADLINE * len(lines) + 0.04 if lines else 0)
     with matplotlib.style.context([*STYLE]):
         figure = Figure(figsize=(width_in * columns, top_in + sum(heights_in)))
-        for number, (line, is_first) in enumerate(told):
+        for number, (line, is_first) in enumerate(lines):
             look: dict[str, Any] = {"weight": "bold"} if is_first else {"color": FAINT}
             y = 1 - (0.1 + _HEADLINE * number) / figure.get_figheight()
             figure.text(_LEFT / figure.get_figwidth(), y, line, va="top", **look)

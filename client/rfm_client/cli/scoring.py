@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.cli.command import ExitCode, exit_code, exit_code_of, missing_package
-from rfm_client.cli.messages import told
+from rfm_client.cli.messages import user_message
 from rfm_client.cli.options import PrefixOptions, VideoOptions
 from rfm_client.cli.pictures import Panel
 from rfm_client.cli.show import at_end, number
@@ -168,7 +168,7 @@ class SourceScorer:
         except (RewardError, OSError) as error:
             if isinstance(error, InvalidSampleError) and error.source == name:  # the report already names it
                 error.source = ""
-            return Failed(name, error, told(error), is_server_gone=self._is_server_gone(error))
+            return Failed(name, error, user_message(error), is_server_gone=self._is_server_gone(error))
         if self.record is not None:
             self.record(number, source, result)
         return Scored(

@@ -147,15 +147,15 @@ def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> str:
     shown = []
     for name, result in rows:
         if isinstance(result, ProgressResult):
-            told = f"{len(result.progress)} frames"
+            answer = f"{len(result.progress)} frames"
         elif isinstance(result, PreferenceResult):
-            told = f"P(first) = {result.preference:.4f}"
+            answer = f"P(first) = {result.preference:.4f}"
         else:
-            told = f"similarity = {result.similarity:.4f}"
+            answer = f"similarity = {result.similarity:.4f}"
         for role, frames in trajectory_scores(result).items():
             row = ": ".join(filter(None, (name, role)))
-            shown.append((row, told, at_end(frames), number(frames.success[-1])))
-            told = ""
+            shown.append((row, answer, at_end(frames), number(frames.success[-1])))
+            answer = ""
     return table(title, ("sample", "answer", "progress at the end", "success at the end"), shown)
 
 

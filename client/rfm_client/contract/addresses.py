@@ -140,18 +140,18 @@ class ListenAddress:
             raise InvalidValueError.at(where, expected, reason, remedy) from None
 
 
-_OF_GRPC = ("grpc_proxy", "https_proxy", "http_proxy")  # the first one set counts, even if empty
-_NOT_OF_GRPC = ("no_grpc_proxy", "no_proxy")
+_PROXY_VARIABLES = ("grpc_proxy", "https_proxy", "http_proxy")  # the first one set counts, even if empty
+_NO_PROXY_VARIABLES = ("no_grpc_proxy", "no_proxy")
 _CREDENTIALS = re.compile(r"[^/@]*@")
 
 
 def grpc_proxy(address: str) -> str | None:
     """Return ``VARIABLE=VALUE`` for the proxy that gRPC uses for ``host:port``, without a password; None: no proxy."""
     host = host_of(address)
-    name = next((name for name in _OF_GRPC if name in os.environ), None)
+    name = next((name for name in _PROXY_VARIABLES if name in os.environ), None)
     if name is None or not os.environ[name] or is_loopback(host):
         return None
-    excepted = next((os.environ[name] for name in _NOT_OF_GRPC if name in os.environ), "")
+    excepted = next((os.environ[name] for name in _NO_PROXY_VARIABLES if name in os.environ), "")
     if any(_matches(host, entry.strip()) for entry in excepted.split(",") if entry.strip()):
         return None
     return _shown(name, os.environ[name])

@@ -175,12 +175,12 @@ class Description(Origin):
         """Return the description in parameter DESCRIPTION_PARAMETER. Raises InvalidValueError."""
         expected = "the JSON object of an export"
         try:
-            told = json.loads(text)
+            content = json.loads(text)
         except ValueError as error:
             raise InvalidValueError.at(_WHERE, expected, f"{text!r:.80}: {error}" if text else "none") from None
-        require(_WHERE, isinstance(told, dict), expected, f"{text!r:.80}")
+        require(_WHERE, isinstance(content, dict), expected, f"{text!r:.80}")
         kinds = typing.get_type_hints(cls)
-        return cls(**{name: _read(name, value, kinds[name]) for name, value in told.items() if name in kinds})
+        return cls(**{name: _read(name, value, kinds[name]) for name, value in content.items() if name in kinds})
 
 
 def _read(name: str, value: Any, kind: Any) -> Any:

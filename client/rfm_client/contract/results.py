@@ -71,7 +71,7 @@ class Score:
         """Return the name for an axis, with the unit: ``remaining (s)``."""
         return f"{self.short(name)} ({self.unit})" if self.unit else name
 
-    def told(self, values: npt.NDArray[Any]) -> str:
+    def mark_note(self, values: npt.NDArray[Any]) -> str:
         """Return a line about the marked frames among ``values``, [T]; empty: none is marked."""
         count = np.count_nonzero(values) if self.mark else 0
         return f"{count} of {len(values)} frames: {self.mark}" if count else ""

@@ -58,7 +58,7 @@ _NO_INPUT = re.compile(
     r"(?:expected (?:number of inputs between \d+ and )?\d+ (?:inputs )?but got .*|unexpected .*input )"
     rf"'(?P<name>{'|'.join((SECOND_FRAMES, *VIEWS, GOAL))})'"
 )
-_OF_VIEWS = (
+_WITHOUT_VIEWS = (
     "a model that reads views and a goal, such as Robo-Dopamine",
     "one that reads the frames of one camera",
     "leave out views and goal",
@@ -67,7 +67,7 @@ _OLD = "one that was exported before there was this input"
 # By optional input: a model that has it, one that lacks it, and the remedy.
 _WITHOUT = {
     SECOND_FRAMES: ("a model that takes pairs of two frame sizes", _OLD, "export it again, or resize a trajectory"),
-    **dict.fromkeys((*VIEWS, GOAL), _OF_VIEWS),
+    **dict.fromkeys((*VIEWS, GOAL), _WITHOUT_VIEWS),
 }
 _NO_OUTPUT = re.compile(r"unexpected inference output '(\w+)'")
 _FIELDS = re.compile(r"(\S+): expected (.*?), got (.*)", re.DOTALL)  # as written by ``LocatedError``
@@ -196,8 +196,8 @@ def denied(url: str, status: str, message: str) -> errors.AccessDeniedError:
 
 def unreachable(url: str, reason: str, proxy: str | None = None) -> errors.ServerUnavailableError:
     """Return the error for a failed connection to the server or its proxy."""
-    told = _REASON.search(reason)
-    reason = told[1] if told else reason
+    found = _REASON.search(reason)
+    reason = found[1] if found else reason
     if proxy is None:
         return _with_remedy(errors.ServerUnavailableError, f"{url}: no connection: {reason}", _START)
     fault = f"{url}: no connection through {proxy}: {reason}"

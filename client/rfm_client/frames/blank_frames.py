@@ -75,9 +75,9 @@ class BlankFrames:
             return "black pictures"
         if highest > _BLACK:
             return "pictures that are black or of one colour"
-        told = f"black pictures, no value above {highest}"
+        text = f"black pictures, no value above {highest}"
         remedy = " (multiply floats in 0..1 by 255 before they become uint8)"
-        return told + remedy * (highest <= _FLOATS)
+        return text + remedy * (highest <= _FLOATS)
 
 
 def _is_flat(pixels: UInt8Array) -> bool:

@@ -143,10 +143,10 @@ def _errors_of(source: str | Path) -> Iterator[None]:
     except InvalidSampleError as error:
         raise InvalidSampleError.like(error, source=str(source)) from error
     except (import_av().FFmpegError, OSError) as error:
-        told = InvalidSampleError.at("video", _EXPECTED, _read_instead(error))
+        located = InvalidSampleError.at("video", _EXPECTED, _read_instead(error))
         if isinstance(error, FileNotFoundError):
-            told = InvalidSampleError.at("video", "a video file", "no file of this name")
-        raise InvalidSampleError.like(told, source=str(source)) from error
+            located = InvalidSampleError.at("video", "a video file", "no file of this name")
+        raise InvalidSampleError.like(located, source=str(source)) from error
 
 
 def _read_instead(error: Exception) -> object:

@@ -72,9 +72,9 @@ def video_stream(container: Any) -> Any:
         raise FrameFileError.of("a file with a video stream", "none")
     if len(videos) > 1:
         codecs = {n: stream.codec_context for n, stream in videos.items()}
-        told = ", ".join(f"0:v:{n} ({codec.name}, {codec.width}x{codec.height})" for n, codec in codecs.items())
+        streams = ", ".join(f"0:v:{n} ({codec.name}, {codec.width}x{codec.height})" for n, codec in codecs.items())
         expected = "one video stream (take one: ffmpeg -i IN -map 0:v:N -c copy OUT)"
-        raise FrameFileError.of(expected, f"{len(videos)}: {told}")
+        raise FrameFileError.of(expected, f"{len(videos)}: {streams}")
     (stream,) = videos.values()
     _check_colours(stream.codec_context.format)
     return stream

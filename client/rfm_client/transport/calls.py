@@ -188,8 +188,8 @@ class TritonTransport:
         with suppress(Exception):
             async with timeout(_SERVED_TIMEOUT_S):
                 with self._connected().used() as client:
-                    told = await client.get_inference_statistics(**self.as_json)
-                    served = {each["name"] for each in told.get("model_stats", [])}
+                    statistics = await client.get_inference_statistics(**self.as_json)
+                    served = {each["name"] for each in statistics.get("model_stats", [])}
                     return triton.not_served(model, error.message, served)
         return error
 

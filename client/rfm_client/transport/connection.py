@@ -201,7 +201,7 @@ _HTTP2_FRAME = "\x00\x00"  # a gRPC server's answer to HTTP/1.1 starts with this
 
 _GRPC, _HTTP, _METRICS, _GATEWAY = "its gRPC port", "its HTTP port", "its metrics port", "a gateway's"
 _EXPECTED = {"grpc": (_GRPC, "Triton's gRPC port", 8001), "http": (_HTTP, "Triton's HTTP port", 8000)}
-OF_A_PORT = (  # errors that a wrong port may cause
+WRONG_PORT_ERRORS = (  # errors that a wrong port may cause
     errors.ServerUnavailableError,
     errors.AccessDeniedError,
     errors.InferenceFailedError,

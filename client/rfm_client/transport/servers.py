@@ -37,7 +37,7 @@ from rfm_client.contract.errors import (
 )
 from rfm_client.contract.wire import Tensors
 from rfm_client.transport.calls import Answer, Transport, TritonTransport
-from rfm_client.transport.connection import OF_A_PORT, wrong_port
+from rfm_client.transport.connection import WRONG_PORT_ERRORS, wrong_port
 from rfm_client.transport.limits import Deadline
 
 Answered = TypeVar("Answered")
@@ -165,8 +165,8 @@ class Servers:
         if len(self._servers) > 1:
             others = [server.transport for server in self._servers if not server.is_left_out]
             left_s = deadline.remaining_s()
-            told = await asyncio.gather(*(each.model_info(model, left_s) for each in others), return_exceptions=True)
-            for outcome in told:
+            replies = await asyncio.gather(*(each.model_info(model, left_s) for each in others), return_exceptions=True)
+            for outcome in replies:
                 if isinstance(outcome, ModelInfo):
                     infos.append(outcome)
                 elif not isinstance(outcome, RewardError):
@@ -216,7 +216,7 @@ class Servers:
             clear_variables(error)
             if self._is_closed and not _is_task_cancelled():  # closing connections raise errors from many classes
                 raise ClientClosedError("this client was closed during the call") from error
-            if isinstance(error, OF_A_PORT) and not any(server.has_answered for server in self._servers):
+            if isinstance(error, WRONG_PORT_ERRORS) and not any(server.has_answered for server in self._servers):
                 for named in filter(None, await self._wrong_ports()):
                     raise ServerUnavailableError(named) from error
             raise

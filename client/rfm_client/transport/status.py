@@ -22,7 +22,7 @@ from rfm_client.contract.addresses import open_url, split_url
 from rfm_client.contract.errors import DeadlineExceededError, ServerUnavailableError
 from rfm_client.contract.wire import encoder_name, frames_name
 from rfm_client.transport.calls import connect
-from rfm_client.transport.connection import OF_A_PORT, Credentials, wrong_port
+from rfm_client.transport.connection import WRONG_PORT_ERRORS, Credentials, wrong_port
 
 METRICS_PORT = 8002
 METRICS_OPTION = "--metrics-url"
@@ -46,7 +46,7 @@ _MS_PER_S = 1e3
 _US_PER_S = 1e6
 
 _Version: TypeAlias = tuple[str, str]  # a model's name and version
-_Told: TypeAlias = tuple[  # version, readiness, and every model's index entry and statistics
+_ServerState: TypeAlias = tuple[  # version, readiness, and every model's index entry and statistics
     str, bool, dict[_Version, tuple[Mapping[str, Any], Mapping[str, Any]]]
 ]
 
@@ -185,7 +185,7 @@ class ServerStatus:
             version, is_ready, models = asyncio.run(_state(url, timeout_s, credentials))
         except DeadlineExceededError as late:
             raise DeadlineExceededError(f"{late.server}: no answer within {timeout_s:g} s") from late
-        except OF_A_PORT as error:
+        except WRONG_PORT_ERRORS as error:
             if named := wrong_port(url):
                 raise ServerUnavailableError(named) from error
             raise
@@ -209,11 +209,11 @@ class _Metrics:
     error: str | None = None
 
 
-async def _state(url: str, timeout_s: float, credentials: Credentials | None) -> _Told:
+async def _state(url: str, timeout_s: float, credentials: Credentials | None) -> _ServerState:
     """Return the server's version, whether it is ready, and every model's index entry and statistics."""
     transport = connect(url, credentials=credentials)
 
-    async def request(client: Any) -> _Told:
+    async def request(client: Any) -> _ServerState:
         version = (await client.get_server_metadata(**transport.as_json))["version"]
         statistics = (await client.get_inference_statistics(**transport.as_json)).get("model_stats", [])
         try:

@@ -21,7 +21,7 @@ PROGRESS_TOKEN = "<|prog_token|>"
 # In the order in which the tokenizer gets them.
 SPECIAL_TOKENS = (SPLIT_TOKEN, REWARD_TOKEN, PREFERENCE_TOKEN, SIMILARITY_TOKEN, PROGRESS_TOKEN)
 OLD_SPECIAL_TOKENS = 8  # upstream's special token count before 2026-01-21
-OF_AN_OLD_RUN = (
+OLD_RUN_REMEDY = (
     "upstream's networks have it since 2026-01-21. A run of before that day was trained with 8 special tokens in place "
     "of 5, and with resized images; score it with the upstream commit that trained it, or train it anew"
 )

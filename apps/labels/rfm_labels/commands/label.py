@@ -32,8 +32,8 @@ from rfm_labels.scorer import ClientScorer, Scorer
 from rfm_labels.summary import Summary, summarise
 
 SPEED_OVER_S = 600.0  # an episode may take minutes
-Say: TypeAlias = Callable[[str], None]
-_OF_CAMERAS = ("orient", "channels")  # options with a value per camera
+Printer: TypeAlias = Callable[[str], None]
+_CAMERA_OPTIONS = ("orient", "channels")  # options with a value per camera
 DatasetArgument = Annotated[
     str,
     typer.Argument(
@@ -47,7 +47,7 @@ DatasetArgument = Annotated[
 class ProgressBar(Watch):
     """Writes notes to standard error and, on a terminal, shows a bar with speed and remaining time."""
 
-    def __init__(self, say: Say) -> None:
+    def __init__(self, say: Printer) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn, TimeRemainingColumn
         from rich.text import Text
@@ -155,14 +155,14 @@ class EpisodeTexts(Settings):
         super().__post_init__()
         if self.override_task and not self.task:
             raise ConfigError.of_two("override_task", "needs", "task")
-        for option in _OF_CAMERAS:
+        for option in _CAMERA_OPTIONS:
             parsed_by_camera(option, getattr(self, option))
 
     @property
     def opening(self) -> dict[str, Any]:
         """Keyword arguments for ``open_dataset``."""
         given = {each.name: getattr(self, each.name) for each in fields(self)}
-        return given | {option: parsed_by_camera(option, given[option]) for option in _OF_CAMERAS}
+        return given | {option: parsed_by_camera(option, given[option]) for option in _CAMERA_OPTIONS}
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ class LabelCommand:
     options: RunOptions
     ray: RayOptions
     connect: Connect
-    say: Say
+    say: Printer
 
     def run(self) -> ExitCode:
         """Run as the options say. Raises RewardError, OSError and ImportError."""
@@ -262,8 +262,8 @@ class LabelCommand:
                 unused.append(error)
                 command = replace(command, texts=replace(command.texts, task=None))
             except RewardError as error:
-                told = error.lines if isinstance(error, FaultsError) else [str(error)]
-                lines += [line if command.source in line else f"{command.source}: {line}" for line in told]
+                messages = error.lines if isinstance(error, FaultsError) else [str(error)]
+                lines += [line if command.source in line else f"{command.source}: {line}" for line in messages]
             checked.append(command)
         if lines:
             raise FaultsError.listing(lines)

@@ -164,11 +164,11 @@ class TaskOverride:
     is_needed: bool = True
 
     def __post_init__(self) -> None:
-        is_said = not is_blank(self.text)
+        has_text = not is_blank(self.text)
         got = "none" if self.text is None else repr(self.text)
         kinds = get_args(SeveralTasks)
         require("several_tasks", self.several in kinds, f"one of {', '.join(kinds)}", repr(self.several))
-        require("task", is_said or (self.text is None and not self.overrides), "a sentence", got)
+        require("task", has_text or (self.text is None and not self.overrides), "a sentence", got)
         is_read = self.column is None or not self.overrides
         require("task_column", is_read, "none with --override-task, which reads no tasks", self.column)
 

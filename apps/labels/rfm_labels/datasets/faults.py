@@ -72,9 +72,9 @@ class FaultsError(DatasetError):
         alike: dict[str, list[int]] = {}
         for number, fault in faults.items():
             alike.setdefault(str(fault), []).append(number)
-        told = [text if len(those) == 1 else f"{text} (episodes {listed(those)})" for text, those in alike.items()]
+        texts = [text if len(those) == 1 else f"{text} (episodes {listed(those)})" for text, those in alike.items()]
         head = f"episodes: expected {len(numbers)} that can be labelled, got {len(faults)} with faults:"
-        lines = [*[head] * (len(told) > 1), *shortened(told)]
+        lines = [*[head] * (len(texts) > 1), *shortened(texts)]
         num_without_task = sum(isinstance(fault, MissingTaskError) for fault in faults.values())
         if num_without_task > 1:
             lines.append(f'for the {num_without_task} without a task: --task "SENTENCE"')

@@ -113,11 +113,11 @@ def _several_kinds(folder: Path, names: Sequence[_Name], place: int | None) -> D
     """The error for several kinds of names."""
     kinds: Mapping[str, int] = Counter(name.kind(place) for name in names)
     shortest = sorted(kinds, key=lambda kind: (len(kind), kind))
-    told = " and ".join(f"{kind} ({kinds[kind]})" for kind in shortest[:_EXAMPLES])
+    examples = " and ".join(f"{kind} ({kinds[kind]})" for kind in shortest[:_EXAMPLES])
     if max(kinds.values()) == 1:
         remedy = "copy them to a folder of their own, as 0.png and 1.png"
-        return DatasetError.at(folder, "names that differ in a number", f"{told}: {remedy}")
-    got = f"{told}: list those of one camera in tasks.csv, as {folder.name}/{shortest[0]}"
+        return DatasetError.at(folder, "names that differ in a number", f"{examples}: {remedy}")
+    got = f"{examples}: list those of one camera in tasks.csv, as {folder.name}/{shortest[0]}"
     return DatasetError.at(folder, "pictures of one camera, whose names differ in a number", got)
 
 
@@ -356,11 +356,11 @@ def _recording(folder: Path) -> tuple[str | None, Mapping[str, Sequence[Path]]]:
     """The task and each camera's pictures. Raises DatasetError, also if a frame lacks one of the cameras."""
     file = folder / _UNITREE_FILE
     try:
-        told = json.loads(file.read_bytes())
-        frames = [frame[_UNITREE_FOLDER] for frame in told["data"]]
+        content = json.loads(file.read_bytes())
+        frames = [frame[_UNITREE_FOLDER] for frame in content["data"]]
         names = dict.fromkeys(name for frame in frames for name in frame)
         files = {name: [folder / _UNITREE_FOLDER / Path(frame[name]).name for frame in frames] for name in names}
-        return told.get("text", {}).get("goal"), files
+        return content.get("text", {}).get("goal"), files
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         expected, got = "a picture of each camera in each frame", f"{type(error).__name__}: {error}; {_LEAVE_OUT}"
         raise DatasetError.at(file, expected, got) from error

@@ -116,8 +116,8 @@ class Hdf5Dataset(Dataset):
         is_robotwin = self._layout is ROBOTWIN
         unmarked = [camera for camera, file in self._firsts.items() if is_robotwin and not has_rgb_mark(file)]
         self.corrections = corrections.of_cameras(known, defaults, dict.fromkeys(unmarked, "bgr"))
-        untold = [camera for camera in known if {"", camera}.isdisjoint(corrections.orient)]
-        self.notes = [*notes, *([] if is_upright else _notes(untold, is_libero))]
+        uncorrected = [camera for camera in known if {"", camera}.isdisjoint(corrections.orient)]
+        self.notes = [*notes, *([] if is_upright else _notes(uncorrected, is_libero))]
         self.notes += self._notes_on_colours(corrections, unmarked) + self._notes_on_layout()
 
     def _task_in(self, opened: Any, demo: Any, attributes: Mapping[str, Any]) -> Any:
@@ -139,25 +139,25 @@ class Hdf5Dataset(Dataset):
             notes.append(
                 "left out: each first picture, which shows the end of the episode before; frame 0 is the second"
             )
-        told = instructions_of(self.file) if self._layout is ROBOTWIN else []
-        if told and self._tasks[0] == told[0] and self.given_task.text is None:
-            notes.append(f"task: the first of {len(told)} sentences in instructions/{self.file.stem}.json")
+        instructions = instructions_of(self.file) if self._layout is ROBOTWIN else []
+        if instructions and self._tasks[0] == instructions[0] and self.given_task.text is None:
+            notes.append(f"task: the first of {len(instructions)} sentences in instructions/{self.file.stem}.json")
         return notes
 
     def _notes_on_colours(self, asked: AskedCorrections, unmarked: Sequence[str]) -> list[str]:
         """A note on red and blue, for cameras without a channel order from the caller."""
-        untold = [camera for camera in self._firsts if {"", camera}.isdisjoint(asked.channels)]
-        swapped = [camera for camera in untold if camera in unmarked]
+        uncorrected = [camera for camera in self._firsts if {"", camera}.isdisjoint(asked.channels)]
+        swapped = [camera for camera in uncorrected if camera in unmarked]
         if swapped:
             why = "RoboTwin's JPEG files without its mark of RGB, from before September 2026, store red as blue"
             return [f"channels: {', '.join(swapped)} bgr ({why}; --channels rgb leaves them)"]
         colours = self._layout.colours
-        return [f"channels: {', '.join(untold)} {colours}"] if untold and colours else []
+        return [f"channels: {', '.join(uncorrected)} {colours}"] if uncorrected and colours else []
 
     def read_episode(self, number: int) -> DatasetEpisode:
         where = f"{self.file}: {self._layout.group_of(self._demos[number])}".removesuffix(": ")
-        told = " or ".join(name + " (no JSON object)" * (name in self._broken) for name in DOCUMENTS)
-        places = f"ep_meta, or data: {told}" if self._layout.is_in_data else task_places(self.file)
+        documents = " or ".join(name + " (no JSON object)" * (name in self._broken) for name in DOCUMENTS)
+        places = f"ep_meta, or data: {documents}" if self._layout.is_in_data else task_places(self.file)
         task = self.given_task.of(f"{where}: {places}", self._tasks[number])
         lengths = self._lengths[number]
         got = ", ".join(f"{key} {length}" for key, length in lengths.items()) or self._forms[number]
@@ -188,8 +188,8 @@ class Hdf5Dataset(Dataset):
 
     def _shared(self, numbers: Sequence[int]) -> tuple[Sequence[str], Mapping[str, str]]:
         """The cameras that all these demonstrations share, and what is wrong with other pictures."""
-        told = {name: [faults[number] for number in numbers] for name, faults in self._pictures.items()}
-        faults = {name: next(filter(None, of_demos), "") for name, of_demos in told.items()}
+        chosen = {name: [faults[number] for number in numbers] for name, faults in self._pictures.items()}
+        faults = {name: next(filter(None, of_demos), "") for name, of_demos in chosen.items()}
         cameras = tuple(name for name, fault in faults.items() if not fault)
         return cameras, {name: fault for name, fault in faults.items() if fault}
 
@@ -253,11 +253,11 @@ def _one_length(lengths: Mapping[str, int]) -> int:
     return length if lengths.get(_ACTIONS, length) in (length, length - 1) else 0
 
 
-def _notes(untold: Sequence[str], is_libero: bool) -> Sequence[str]:
-    if is_libero and untold:
+def _notes(uncorrected: Sequence[str], is_libero: bool) -> Sequence[str]:
+    if is_libero and uncorrected:
         why = "LIBERO stores its pictures upside down; --orient none leaves them"
-        return [f"orient: {', '.join(untold)} {_LIBERO} ({why})"]
-    doubtful = [camera for camera in untold if camera in _LIBERO_CAMERAS]
+        return [f"orient: {', '.join(uncorrected)} {_LIBERO} ({why})"]
+    doubtful = [camera for camera in uncorrected if camera in _LIBERO_CAMERAS]
     if not doubtful:
         return []
     advice = f"look at a frame, and turn them with --orient {_LIBERO} if they are upside down"

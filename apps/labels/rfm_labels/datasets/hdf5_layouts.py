@@ -84,12 +84,12 @@ def filter_keys(opened: Any, names: Mapping[int, str]) -> tuple[Mapping[str, Seq
     found: dict[str, Sequence[int]] = {}
     notes = ["left out: mask: expected a group"] if "mask" in opened and not hasattr(group, "keys") else []
     for key, stored in members_of(group).items():
-        told = texts_in(stored)
-        known = [numbers.get(name, _missing_number(name, names)) for name in told or ()]
-        if told is not None and None not in known:
+        texts = texts_in(stored)
+        known = [numbers.get(name, _missing_number(name, names)) for name in texts or ()]
+        if texts is not None and None not in known:
             found[key] = sorted(number for number in known if number is not None)
         else:
-            others = [name for name, number in zip(told or (), known, strict=True) if number is None]
+            others = [name for name, number in zip(texts or (), known, strict=True) if number is None]
             notes.append(
                 f"left out: mask/{key}: expected names of demonstrations, got {first_names(others) or 'no text'}"
             )
@@ -146,8 +146,8 @@ def is_of_libero(attributes: Mapping[str, Any]) -> bool:
 
 def fps_of(attributes: Mapping[str, Any]) -> float:
     """Return the frame rate in Hz: robosuite's control frequency, else its default."""
-    told = document(attributes, "env_args").get("env_kwargs")
-    fps = told.get("control_freq") if isinstance(told, dict) else None
+    env_kwargs = document(attributes, "env_args").get("env_kwargs")
+    fps = env_kwargs.get("control_freq") if isinstance(env_kwargs, dict) else None
     return float(fps) if isinstance(fps, int | float) and 0 < fps < 1000 else _DEFAULT_FPS
 
 
@@ -355,7 +355,7 @@ def instructions_of(file: Path) -> list[str]:
     if not side.is_file():
         return []
     try:
-        told = json.loads(side.read_text(encoding="utf-8"))
-        return [str(text) for kind in ("seen", "unseen") for text in told.get(kind, ())]
+        content = json.loads(side.read_text(encoding="utf-8"))
+        return [str(text) for kind in ("seen", "unseen") for text in content.get(kind, ())]
     except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
         raise DatasetError.at(side, 'a JSON object {"seen": [sentences]}', f"{error}: correct or remove it") from error

@@ -81,9 +81,9 @@ class LeRobotDataset(Dataset):
         counts = {"episodes": (len(self.numbers), info.total_episodes)}
         if len(lengths) == len(self._entries):
             counts["frames"] = (sum(lengths), info.total_frames)
-        for name, (count, told) in counts.items():
-            if count != told:
-                note = f"{name}: {count}, as {_LISTED_IN[info.version]} lists them; info.json says {told}"
+        for name, (count, stated) in counts.items():
+            if count != stated:
+                note = f"{name}: {count}, as {_LISTED_IN[info.version]} lists them; info.json says {stated}"
                 self.notes = [*self.notes, note]
 
     def _sentences(self) -> Sentences:

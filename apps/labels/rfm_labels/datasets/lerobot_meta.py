@@ -22,14 +22,14 @@ VERSIONS = ("v2.0", "v2.1", "v3.0")
 EPISODES_FILE = Path("meta", "episodes.jsonl")
 EPISODES_FOLDER = Path("meta", "episodes")
 
-_OF_PICTURES = ("info", "video_info")  # keys in a camera feature, by writer version
+_CAMERA_INFO_KEYS = ("info", "video_info")  # keys in a camera feature, by writer version
 _DEPTH_MARKS = ("video.is_depth_map", "is_depth_map")
 _CAMERA_KINDS = ("video", "image")
-_OF_AN_EPISODE = (
+_EPISODE_COLUMNS = (
     *("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index"),
     *("data/chunk_index", "data/file_index"),
 )
-_OF_A_VIDEO = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
+_VIDEO_COLUMNS = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,8 @@ class Info:
 
 
 def _is_depth(feature: Mapping[str, Any]) -> bool:
-    told = [feature[name] for name in _OF_PICTURES if isinstance(feature.get(name), dict)]
-    return any(each.get(mark) is True for each in told for mark in _DEPTH_MARKS)
+    infos = [feature[name] for name in _CAMERA_INFO_KEYS if isinstance(feature.get(name), dict)]
+    return any(each.get(mark) is True for each in infos for mark in _DEPTH_MARKS)
 
 
 def _no_colours(feature: Mapping[str, Any]) -> str:
@@ -216,9 +216,9 @@ def _entry_v21(info: Info, where: str, index: int, line: Mapping[str, Any]) -> E
 def _entries_v30(info: Info) -> Iterator[tuple[int, Entry | DatasetError]]:
     files = sorted((info.root / EPISODES_FOLDER).rglob("*.parquet"))
     require(info.root / EPISODES_FOLDER, bool(files), "Parquet files", "none")
-    of_videos = [f"videos/{key}/{name}" for key in info.videos for name in _OF_A_VIDEO]
+    of_videos = [f"videos/{key}/{name}" for key in info.videos for name in _VIDEO_COLUMNS]
     for file in files:
-        for row in read_table(file, [*_OF_AN_EPISODE, *of_videos]).to_pylist():
+        for row in read_table(file, [*_EPISODE_COLUMNS, *of_videos]).to_pylist():
             index = row["episode_index"]
             require(f"{file}: episode_index", index is not None, "a value", "none")
             try:
@@ -230,7 +230,7 @@ def _entries_v30(info: Info) -> Iterator[tuple[int, Entry | DatasetError]]:
 def _entry_v30(info: Info, file: Path, row: dict[str, Any]) -> Entry:
     index, length = row["episode_index"], row["length"]
     where = f"episode {index}: {file}"
-    for name in _OF_AN_EPISODE:
+    for name in _EPISODE_COLUMNS:
         require(f"{where}: {name}", row[name] is not None, "a value", "none")
     first, end = row["dataset_from_index"], row["dataset_to_index"]
     require(f"{where}: length", end - first == length, f"{end - first}, from {first} to {end}", length)
@@ -247,7 +247,7 @@ def _entry_v30(info: Info, file: Path, row: dict[str, Any]) -> Entry:
 
 def _video(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float] | DatasetError:
     """A camera's video and the episode's start in it, or a fault, which counts only if the camera is used."""
-    names = [f"videos/{key}/{name}" for name in _OF_A_VIDEO]
+    names = [f"videos/{key}/{name}" for name in _VIDEO_COLUMNS]
     try:
         for name in names:
             got = "none: leave this camera out (--cameras), or the episode (--episodes)"
@@ -258,7 +258,7 @@ def _video(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path,
 
 
 def _place(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float]:
-    chunk, number, from_s, to_s = (row[f"videos/{key}/{name}"] for name in _OF_A_VIDEO)
+    chunk, number, from_s, to_s = (row[f"videos/{key}/{name}"] for name in _VIDEO_COLUMNS)
     lasts_s, expected_s = to_s - from_s, row["length"] / info.fps
     is_long_enough = lasts_s >= expected_s - 0.5 / info.fps  # longer: includes frames from a discarded take
     expected = f"{expected_s:.4f} s for {row['length']} frames"

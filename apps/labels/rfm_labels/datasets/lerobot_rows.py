@@ -35,7 +35,7 @@ _WHOLE_OR_NOT = re.compile(r"halffloat|float|double")  # whole numbers become fl
 _SENTENCES = re.compile(r"(dictionary<values=)?(large_)?string\b.*")
 _IDENTITY = ("index", "episode_index", "frame_index")
 _STYLE = "subtask"
-_INDEX_OF_PANDAS = "__index_level_0__"  # pandas' column name for an unnamed index
+_PANDAS_INDEX = "__index_level_0__"  # pandas' column name for an unnamed index
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,11 +220,11 @@ def values_in(where: str, column: Any, own: npt.NDArray[np.int64], times_s: npt.
     if isinstance(column, np.ndarray):
         return column[own]
     stored: Sequence[Mapping[str, Any]] = column[int(own[0])].as_py() or []  # the same in all rows of an episode
-    told = {row["timestamp"]: row["content"] for row in stored if row["style"] == _STYLE}
-    is_one = all(told[row["timestamp"]] == row["content"] for row in stored if row["style"] == _STYLE)
+    content_at = {row["timestamp"]: row["content"] for row in stored if row["style"] == _STYLE}
+    is_one = all(content_at[row["timestamp"]] == row["content"] for row in stored if row["style"] == _STYLE)
     require(where, is_one, f"one {_STYLE} at a time", "several")
-    starts_s = sorted(told)
-    contents = [None, *(told[start_s] for start_s in starts_s)]
+    starts_s = sorted(content_at)
+    contents = [None, *(content_at[start_s] for start_s in starts_s)]
     return np.array([contents[k] for k in np.searchsorted(starts_s, times_s, side="right")], dtype=object)
 
 
@@ -254,7 +254,7 @@ def read_sentences(file: Path, name: str = "task") -> dict[int, str | None]:
         for column, values in columns.items()
         if all(value is None or isinstance(value, str) for value in values)
     }
-    of_pandas = next((column for column in (_INDEX_OF_PANDAS, name) if column in texts), None)
+    of_pandas = next((column for column in (_PANDAS_INDEX, name) if column in texts), None)
     column = of_pandas or (next(iter(texts)) if len(texts) == 1 else None)
     got = f"{'no ' * (numbers is None)}{name}_index and {len(texts)} of them"
     require(file, numbers is not None and column is not None, f"{name}_index and one column of sentences", got)

@@ -69,7 +69,7 @@ _KINDS: dict[str, tuple[type[EpisodeFiles], str]] = {  # reader, and what an epi
     "recordings of Unitree": (UnitreeFolders, "folder"),
 }
 _OWN_TASKS = ("arrays", "recordings of Unitree")
-_FILES_OF_OURS = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside labelled episodes; HDF5: from 0.4
+_OUR_FILES = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside labelled episodes; HDF5: from 0.4
 
 
 def read_table_of_tasks(table: Path, *, has_tasks: bool) -> Mapping[str, str | None]:
@@ -227,7 +227,7 @@ def hdf5_files(folder: str | Path) -> list[Path]:
     if not root.is_dir() or is_other or set(_found(root)) - {"HDF5 files"}:
         return []
     names = (str(file.relative_to(root)) for file in root.rglob("*") if file.suffix.lower() in SUFFIXES)
-    shown = [name for name in names if "/." not in f"/{name}" and not _FILES_OF_OURS.fullmatch(name)]
+    shown = [name for name in names if "/." not in f"/{name}" and not _OUR_FILES.fullmatch(name)]
     return [root / name for name in in_natural_order(shown)]
 
 
@@ -240,8 +240,8 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
         tasks = read_table_of_tasks(table, has_tasks=task.text is None)
         there = [name for name in tasks if (table.parent / name).exists()] or list(tasks)
         kinds = {_kind_of(table.parent / name): name for name in reversed(there)}
-        told = " and ".join(f"{kind} ({name})" for kind, name in sorted(kinds.items()))
-        require(table, len(kinds) == 1, "episodes of one kind", f"{told}: write a table for each kind")
+        examples = " and ".join(f"{kind} ({name})" for kind, name in sorted(kinds.items()))
+        require(table, len(kinds) == 1, "episodes of one kind", f"{examples}: write a table for each kind")
         (kind,) = kinds
         dataset = _KINDS[kind][0](Contents(table.parent, tasks, table, task, corrections))
         dataset.notes = [*dataset.notes, *_unlisted(table, kind, tasks)]
@@ -249,10 +249,10 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
     kind, names = _listed(path)
     reader, episode = _KINDS[kind]
     is_of_before = (path / "tasks.json").is_file()  # from 0.4
-    is_told = (task.text is not None or kind in _OWN_TASKS) and not is_of_before
+    is_task_known = (task.text is not None or kind in _OWN_TASKS) and not is_of_before
     got = f"none: write it, or, if all of them have one task, give it: {_GIVE_TASK}"
     got = f"tasks.json: write it as {TABLE}, with the columns video and task" if is_of_before else got
-    require(path, is_told, f"{TABLE} with the task of each {episode}", got)
+    require(path, is_task_known, f"{TABLE} with the task of each {episode}", got)
     return reader(Contents(path, dict.fromkeys(names), path, task, corrections))
 
 
@@ -264,8 +264,8 @@ def _unlisted(table: Path, kind: str, names: Collection[str]) -> list[str]:
     if kind == "folders of pictures":  # ``_found`` also has folders without pictures
         found = [each for each in found if any(_is_frame(file) for file in each.iterdir())]
     gone = in_natural_order({Path(os.path.relpath(each, table.parent)).as_posix() for each in found} - set(names))
-    told = f"{table.name}: {len(gone)} {kind} beside it are not listed and get no labels: {first_names(gone)}"
-    return [told] if gone else []
+    note = f"{table.name}: {len(gone)} {kind} beside it are not listed and get no labels: {first_names(gone)}"
+    return [note] if gone else []
 
 
 def _kind_of(path: Path) -> str:
@@ -277,8 +277,8 @@ def _kind_of(path: Path) -> str:
 def _listed(folder: Path) -> tuple[str, list[str]]:
     """The kind and names of the episodes in a folder. Raises DatasetError for several kinds, or none."""
     found = _found(folder)
-    told = " and ".join(f"{kind} ({names[0]})" for kind, names in found.items())
-    got = f"{told}: list the episodes of one kind in tasks.csv"
+    examples = " and ".join(f"{kind} ({names[0]})" for kind, names in found.items())
+    got = f"{examples}: list the episodes of one kind in tasks.csv"
     require(folder, len(found) < 2, "episodes of one kind", got)
     if not any(kind in _KINDS for kind in found):
         other = f"{'other files' if _names_in(folder) else 'an empty folder'}: {_FILL}"
@@ -289,7 +289,7 @@ def _listed(folder: Path) -> tuple[str, list[str]]:
 def _found(folder: Path) -> dict[str, list[str]]:
     """Names that may be episodes, by kind, without hidden files and label files."""
     shown = [folder / name for name in _names_in(folder)]
-    files = [each for each in shown if each.is_file() and not _FILES_OF_OURS.fullmatch(each.name)]
+    files = [each for each in shown if each.is_file() and not _OUR_FILES.fullmatch(each.name)]
     folders = [each for each in shown if each.is_dir() and each.name != SIGNALS_FOLDER]
     found = {
         kind: [each.name for each in files if each.suffix.lower() in suffixes]
@@ -306,7 +306,7 @@ def _found(folder: Path) -> dict[str, list[str]]:
 
 
 def _is_frame(file: Path) -> bool:
-    return is_picture(file) and not _FILES_OF_OURS.fullmatch(file.name)
+    return is_picture(file) and not _OUR_FILES.fullmatch(file.name)
 
 
 def _names_in(folder: Path) -> list[str]:

@@ -109,9 +109,9 @@ class RldsDataset(Dataset):
         readable = [record for number in numbers if (record := self._readable(number))]
         blank: dict[str, str] = {}
         for camera in self.cameras if readable else ():
-            told = [record.pictures[camera].blank for record in readable]
-            if all(told):
-                blank[camera] = f"{told[0]} in every chosen episode"
+            descriptions = [record.pictures[camera].blank for record in readable]
+            if all(descriptions):
+                blank[camera] = f"{descriptions[0]} in every chosen episode"
         cameras = [camera for camera in self.cameras if camera not in blank]
         require(self.root, bool(cameras), "a camera that shows something", "; ".join(map(": ".join, blank.items())))
         return cameras, {**self.left_out, **blank}
@@ -146,8 +146,8 @@ class RldsDataset(Dataset):
             counts = {name: len(each) for name, each in stored.items()}
             if instruction.startswith("steps/"):
                 counts[instruction] = len(texts)
-            told = ", ".join(f"{name} {count}" for name, count in counts.items())
-            require(where, num_steps > 0 and len({*counts.values()}) == 1, "one number of steps, above 0", told)
+            lengths = ", ".join(f"{name} {count}" for name, count in counts.items())
+            require(where, num_steps > 0 and len({*counts.values()}) == 1, "one number of steps, above 0", lengths)
             pictures = {camera: _pictures(f"{where}: {camera}", each) for camera, each in stored.items()}
             changes = [(t, text) for t, text in enumerate(texts) if t == 0 or text != texts[t - 1]]
             self._records[number] = _Record(num_steps, instruction, changes, pictures)
@@ -167,8 +167,8 @@ class RldsDataset(Dataset):
     def _instruction(self, features: Mapping[str, Any]) -> str:
         """The first feature with a non-blank instruction; else the first feature, or none."""
         known = self._info.instructions
-        said = (name for name in known if any(not is_blank(_shown(text)) for text in self._values(features, name)))
-        return next(said, known[0] if known else "")
+        filled = (name for name in known if any(not is_blank(_shown(text)) for text in self._values(features, name)))
+        return next(filled, known[0] if known else "")
 
     def _tasks(self, number: int, record: _Record) -> list[tuple[int, str]]:
         """First frame and task for each stretch with one task. Raises DatasetError."""

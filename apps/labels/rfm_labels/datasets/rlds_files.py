@@ -184,8 +184,8 @@ class RldsInfo:
         shown = {name.removeprefix(_OBSERVATION): each for name, each in features.items() if _shown(name, each)}
         faults = {name: _fault(each) for name, each in shown.items()}
         cameras = {name: _OBSERVATION + name for name, fault in faults.items() if not fault}
-        told = "; ".join(f"{name}: {fault}" for name, fault in faults.items()) or "none"
-        require(f"{root / FEATURES_FILE}: {_OBSERVATION}", bool(cameras), f"a picture with {_COLOURS}", told)
+        reasons = "; ".join(f"{name}: {fault}" for name, fault in faults.items()) or "none"
+        require(f"{root / FEATURES_FILE}: {_OBSERVATION}", bool(cameras), f"a picture with {_COLOURS}", reasons)
         texts = [name for name, each in features.items() if _is_text(each)]
         instructions = sorted(filter(_rank, texts), key=_rank)
         if task_column is not None:
