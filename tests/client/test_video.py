@@ -124,7 +124,7 @@ BAD_URLS = {
 
 
 @pytest.mark.parametrize(("path", "reason"), BAD_URLS.values(), ids=BAD_URLS)
-def test_a_url_that_fails_is_told_with_its_reason(video: Path, path: str, reason: str) -> None:
+def test_the_error_for_a_url_that_fails_has_the_reason(video: Path, path: str, reason: str) -> None:
     (video.parent / "text.mp4").write_text("no video")
     with serving(video.parent) as (url, _), pytest.raises(InvalidSampleError) as refused:
         load_trajectory(f"{url}/{path}")

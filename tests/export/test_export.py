@@ -50,7 +50,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return repository
 
 
-def test_an_export_holds_what_serving_needs_and_nothing_of_the_training_run(exported: Path) -> None:
+def test_an_export_holds_the_files_for_serving_and_none_of_the_training_run(exported: Path) -> None:
     files = {str(file.relative_to(exported)) for file in exported.rglob("*") if file.is_file()}
     assert {"rfm/1/model.py", "rfm/1/checkpoint/model.safetensors", "rfm/1/checkpoint/config.json"} <= files
     assert {"video_encoder/1/image_encoder/model.safetensors", "video_encoder/1/text_encoder/tokenizer.json"} <= files
@@ -147,7 +147,9 @@ RUNS: dict[str, tuple[str, object, str]] = {  # setting, value, and what is said
 
 
 @pytest.mark.parametrize(("setting", "value", "expected"), RUNS.values(), ids=RUNS)
-def test_an_export_says_what_the_run_did_not_train(tmp_path: Path, setting: str, value: object, expected: str) -> None:
+def test_an_export_notes_settings_of_the_run_that_change_the_meaning_of_scores(
+    tmp_path: Path, setting: str, value: object, expected: str
+) -> None:
     checkpoint = shutil.copytree(EMBEDDINGS.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
     run = training_run(EMBEDDINGS.checkpoint.parent / "config.yaml")
     run["model"] |= {f"train_{head}_head": True for head in HEADS}
