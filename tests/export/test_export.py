@@ -223,7 +223,9 @@ def test_models_tell_their_weights_by_the_files_digest(exported: Path) -> None:
 
 
 @pytest.mark.parametrize("file", ["text_encoder/model.safetensors", "image_encoder/preprocessor_config.json"])
-def test_check_names_what_differs_also_by_other_weights_and_settings(exported: Path, tmp_path: Path, file: str) -> None:
+def test_check_names_missing_and_differing_files_also_by_other_weights_and_settings(
+    exported: Path, tmp_path: Path, file: str
+) -> None:
     repository = shutil.copytree(exported, tmp_path / "repository")
     changed = repository / "video_encoder" / "1" / file
     changed.write_bytes(changed.read_bytes() + b"\n")
@@ -236,7 +238,7 @@ def test_check_names_what_differs_also_by_other_weights_and_settings(exported: P
     ]
 
 
-def test_the_digest_of_settings_is_of_the_dtype_too_and_clients_learn_what_computes(
+def test_the_digest_of_settings_covers_the_dtype_and_clients_learn_the_computation(
     exported: Path, tmp_path: Path
 ) -> None:
     export(FRAMES, tmp_path, name="video", dtype="bfloat16")
@@ -257,7 +259,7 @@ def test_a_set_size_of_batches_wins_also_in_the_check(tmp_path: Path) -> None:
     assert rfm_export.check(tmp_path, replace(settings, max_batch_size=None))  # 64
 
 
-def test_a_checkpoint_of_the_hub_tells_its_commit(tmp_path: Path) -> None:
+def test_the_origin_of_a_checkpoint_of_the_hub_has_its_commit(tmp_path: Path) -> None:
     snapshot = tmp_path / "models--org--name" / "snapshots" / "0123abcd"
     assert origin_of("org/name@best", snapshot, "") == Origin(
         source="org/name@best", revision="0123abcd", computation=""
