@@ -126,7 +126,7 @@ def test_memory_is_bounded_whatever_comes() -> None:
     assert not cache.found([bytes(32)])
 
 
-def test_what_was_used_last_stays() -> None:
+def test_the_most_recently_used_features_stay_in_the_cache() -> None:
     cache = FeatureCache(3 * (64 * 4 + 256))
     features = {bytes([number]): np.zeros(64, np.float32) for number in range(4)}
     for number in range(3):
