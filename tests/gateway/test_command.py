@@ -147,7 +147,7 @@ def test_every_line_about_a_failed_request_names_it(
 GATEWAY, INSTALL = ("gateway", "--triton", NO_TRITON), "pip install ./client ./apps/gateway ./apps/page"
 
 
-def test_the_log_says_that_there_is_no_page_if_one_is_wanted(
+def test_without_rfm_page_the_log_says_so_if_a_page_is_wanted(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(mounting, "entry_points", lambda group: ())

@@ -46,7 +46,7 @@ QUERIES = [target["expr"] for panel in DASHBOARD["panels"] for target in panel.g
 
 
 @pytest.mark.parametrize("name", ["recording", "alerts"])
-def test_rules_do_on_made_up_series_what_they_should(promtool: str, name: str) -> None:
+def test_prometheus_rules_pass_their_tests_on_made_up_series(promtool: str, name: str) -> None:
     for words in (
         ["check", "config", PROMETHEUS / "prometheus.yml"],
         ["test", "rules", PROMETHEUS / "tests" / f"{name}.yml"],
