@@ -94,7 +94,7 @@ CALLS: dict[str, tuple[Callable[[RewardClient], object], int]] = {  # and how ma
 
 
 @pytest.mark.parametrize(("ask", "count"), CALLS.values(), ids=CALLS)
-def test_a_client_tells_once_of_a_video_that_shows_nothing(
+def test_a_client_warns_once_of_a_video_of_black_pictures(
     caplog: pytest.LogCaptureFixture, ask: Callable[[RewardClient], object], count: int
 ) -> None:
     with RewardClient("", transports=[Shelf(has_encoder=False)]) as client:

@@ -39,7 +39,7 @@ def silent_server() -> Iterator[tuple[str, socket.socket]]:
         yield f"http://127.0.0.1:{listening.getsockname()[1]}", listening
 
 
-def test_status_tells_what_triton_counts(served: Served) -> None:
+def test_status_reports_the_counts_of_triton(served: Served) -> None:
     with served.client("grpc", MODEL) as client:
         client.progress(random_trajectory(0, 3, *WIDTHS))
     words = ("status", "--url", served.url("grpc"), "--metrics-url", served.endpoints.metrics_url, "--json", "-")
@@ -81,7 +81,7 @@ BATCHES = {  # of two instances: 40 batches, 120 samples; the work of each batch
 }
 
 
-def test_status_shows_the_gpus_and_what_waits(engines: EngineServer, tmp_path: Path) -> None:
+def test_status_shows_gpus_and_pending_requests(engines: EngineServer, tmp_path: Path) -> None:
     gib = 2**30
     (tmp_path / "metrics").write_text(
         "# TYPE nv_gpu_utilization gauge\n"
@@ -144,7 +144,7 @@ def test_a_server_that_does_not_answer_is_out_of_time(command: str) -> None:
     assert re.fullmatch(r"rfm-client: .*no answer within 0\.2 s\n", result.stderr), result.stderr
 
 
-def test_models_that_are_not_served_are_told(engines: EngineServer, video: Path) -> None:
+def test_scoring_with_a_model_that_is_not_served_fails_and_names_it(engines: EngineServer, video: Path) -> None:
     result = ask(engines, "score", "video.mp4", model="unknown")
     assert result.exit_code == ExitCode.NO_MODEL
     assert re.fullmatch(r"rfm-client: .*unknown_frames.*; served: .*: give the .* \(--model\)\n", result.stderr)
@@ -175,7 +175,7 @@ def test_an_interrupt_ends_it_without_a_traceback() -> None:
     assert (process.returncode, told) == (ExitCode.INTERRUPTED, "rfm-client: interrupted\n")
 
 
-def test_what_is_missing_to_run_is_told_with_the_command_that_installs_it() -> None:
+def test_without_typer_the_client_prints_the_command_that_installs_it() -> None:
     program = "import sys; sys.modules['typer'] = None; from rfm_client.cli import main; main()"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert result.returncode == 1
@@ -225,7 +225,7 @@ PORTS = {
 
 
 @pytest.mark.parametrize(("scheme", "port"), PORTS)
-def test_a_wrong_port_is_told_with_the_right_one(demo_server: Endpoints, scheme: str, port: str) -> None:
+def test_the_error_for_a_wrong_port_names_the_right_one(demo_server: Endpoints, scheme: str, port: str) -> None:
     address = f"127.0.0.1:{getattr(demo_server, port)}"
     expected = f"{scheme}://{address}: expected {PORTS[scheme, port].format(address=address)}"
     for command in ("sample", "status", "wait"):
@@ -237,7 +237,7 @@ def test_a_wrong_port_is_told_with_the_right_one(demo_server: Endpoints, scheme:
     assert str(caught.value) == expected
 
 
-def test_tls_where_there_is_none_is_told(demo_server: Endpoints) -> None:
+def test_the_error_for_tls_to_a_server_without_it_names_the_plain_url(demo_server: Endpoints) -> None:
     for url in (demo_server.grpc_url, demo_server.http_url):
         secure = url.replace("://", "s://")
         with RewardClient(secure, retry=False) as client, pytest.raises(ServerUnavailableError) as caught:
@@ -254,7 +254,7 @@ def test_a_gateway_is_no_triton(demo_server: Endpoints, tmp_path: Path) -> None:
             assert "got a gateway's: use that of the Triton behind it, by default 800" in result.stderr
 
 
-def test_the_port_of_something_else_is_not_told_wrong(tmp_path: Path) -> None:
+def test_the_port_of_another_program_is_not_mistaken_for_one_of_triton(tmp_path: Path) -> None:
     with folder_server(tmp_path) as url:
         result = invoke("sample", "--url", url)
     assert result.exit_code != ExitCode.OK

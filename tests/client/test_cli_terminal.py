@@ -49,7 +49,7 @@ def shown(url: str, *asked: object, code: ExitCode = ExitCode.OK) -> tuple[set[s
     return {*result.stdout.split()}, result.stdout
 
 
-def test_the_state_of_a_server_fits_a_terminal_and_ends_with_what_to_try_next(demo_server: Endpoints) -> None:
+def test_status_fits_a_terminal_and_ends_with_commands_to_try_next(demo_server: Endpoints) -> None:
     url = demo_server.grpc_url
     words, told = shown(url, "status", "--metrics-url", demo_server.metrics_url)
     heads = {"model", "v", "state", "requests", "failed", "refused", "pending", "batches", "samples", "queue", "ms"}
@@ -94,7 +94,7 @@ PROGRAMS: dict[str, list[object]] = {
 
 
 @pytest.mark.parametrize(("names", "words"), PROGRAMS.items())
-def test_a_command_tells_its_version(names: str, words: list[object]) -> None:
+def test_each_command_prints_its_version(names: str, words: list[object]) -> None:
     program, distribution = names.split()
     done = subprocess.run([*map(str, words), "--version"], capture_output=True, text=True, check=True)
     assert done.stdout == f"{program} {importlib.metadata.version(distribution)}\n"
@@ -139,7 +139,7 @@ def test_sample_and_bench_input_ask_for_the_same_samples(
             np.testing.assert_array_equal(flat.reshape(1, *request[tensor]["shape"]), array)
 
 
-def test_sample_shows_a_table_and_tells_of_each_that_fails(engines: EngineServer) -> None:
+def test_sample_shows_a_table_and_an_error_line_per_failed_sample(engines: EngineServer) -> None:
     result = ask(engines, "sample", "--sample-type", "preference", "--num-samples", 2, "--num-frames", "3,17")
     assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
     for index, line in enumerate(result.stderr.splitlines()):
@@ -150,7 +150,7 @@ def test_sample_shows_a_table_and_tells_of_each_that_fails(engines: EngineServer
     assert f"P(first) = {expected.preference:.4f}" in good.stdout  # type: ignore[union-attr]
 
 
-def test_a_score_that_is_not_told_is_null_and_shown_as_a_dash() -> None:
+def test_a_score_that_is_not_predicted_is_null_in_json_and_shown_as_a_dash() -> None:
     scores = FrameScores(progress=np.float32([0.25, 0.5]), success=np.full(2, np.nan, np.float32))
     document = frame_document(scores, None)
     assert (document["progress"], document["success"]) == ([0.25, 0.5], None)

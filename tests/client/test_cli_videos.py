@@ -40,7 +40,7 @@ EVENLY = np.rint(np.linspace(0, clip.NUM_FRAMES - 1, MAX_FRAMES)).astype(int)
 
 
 @pytest.mark.slow
-def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_others(
+def test_score_writes_the_client_s_scores_and_one_bad_video_does_not_stop_the_others(
     engines: EngineServer, video: Path, tmp_path: Path
 ) -> None:
     embeddings = tmp_path / "embeddings.npz"
@@ -107,7 +107,9 @@ def test_score_passes_its_options_on(
     np.testing.assert_allclose(scored["frame_times_s"], np.linspace(0, 31, 10).astype(int) / clip.FPS)
 
 
-def test_score_and_compare_correct_frames_as_they_are_told(engines: EngineServer, video: Path, tmp_path: Path) -> None:
+def test_score_and_compare_apply_the_options_orient_and_channels(
+    engines: EngineServer, video: Path, tmp_path: Path
+) -> None:
     upright, stored = load_trajectory(video, fps=3.0).positions, tmp_path / "stored.npy"
     np.save(stored, upright[:, ::-1, :, ::-1])
     asked = ("--task", TASK, "--orient", "flip-vertical", "--channels", "bgr", "--json")

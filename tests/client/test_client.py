@@ -210,7 +210,7 @@ CALLS: dict[str, tuple[Callable[[RewardClient], object], int]] = {  # and the li
 
 
 @pytest.mark.parametrize(("ask", "num_lines"), CALLS.values(), ids=CALLS)
-def test_a_client_tells_once_of_more_frames_than_in_training(
+def test_a_client_warns_once_of_more_frames_than_in_training(
     caplog: pytest.LogCaptureFixture, ask: Callable[[RewardClient], object], num_lines: int
 ) -> None:
     with RewardClient("", transports=[Shelf(has_encoder=False)]) as client:

@@ -163,7 +163,7 @@ def test_memory_of_a_call_at_work_is_given_back_when_the_client_closes(served: S
 
 
 @pytest.mark.slow
-def test_a_server_that_hangs_does_not_hold_what_shares_memory_with_it(demo_server: Endpoints) -> None:
+def test_closing_a_client_of_a_hanging_server_frees_its_shared_memory(demo_server: Endpoints) -> None:
     before = ours_in_dev_shm()
     with Proxy(demo_server.grpc_port) as proxy:
         client = RewardClient(f"grpc://127.0.0.1:{proxy.port}", shared_memory=True)
@@ -208,7 +208,7 @@ def test_a_killed_client_leaves_no_data(demo_server: Endpoints) -> None:
     assert ours_in_dev_shm() == before
 
 
-def test_a_full_dev_shm_is_told_and_inputs_go_through_the_socket(demo_server: Endpoints) -> None:
+def test_with_a_full_dev_shm_the_client_logs_it_and_sends_inputs_through_the_socket(demo_server: Endpoints) -> None:
     done = ask_elsewhere(demo_server.grpc_url, before=FULL)  # as a full /dev/shm, for this process alone
     assert done.returncode == 0, done.stderr
     assert float(done.stdout) > 0

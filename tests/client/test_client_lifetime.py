@@ -62,7 +62,7 @@ os.wait()
 """
 
 
-def test_a_fork_is_told_to_make_its_own_client_and_that_grpc_was_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_in_a_fork_asks_for_its_own_client_and_mentions_used_grpc(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GRPC_ENABLE_FORK_SUPPORT", "0")  # gRPC's handlers may crash a fork
     done = subprocess.run([sys.executable, "-c", FORKING], capture_output=True, text=True, timeout=60)
     inherited, used = done.stdout.splitlines()
@@ -84,7 +84,7 @@ HOLDERS: dict[str, Callable[[RewardClient], Any]] = {
 
 
 @pytest.mark.parametrize("name", HOLDERS)
-def test_what_holds_a_client_says_what_to_pickle_instead(name: str) -> None:
+def test_pickling_an_object_with_a_client_fails_and_suggests_a_partial_instead(name: str) -> None:
     told = r"pass functools\.partial\(RewardClient, url\) instead, and call that in each"
     with RewardClient(NOBODY) as client:
         holder = HOLDERS[name](client)

@@ -96,7 +96,7 @@ def lost() -> ServerUnavailableError:
     return error
 
 
-def test_what_is_known_of_a_model_is_forgotten_when_another_version_answers() -> None:
+def test_cached_model_info_is_dropped_when_another_version_answers() -> None:
     stand = Stand()
     with RewardClient("", transports=[stand]) as client:
         for _ in range(3):
@@ -192,7 +192,7 @@ def test_a_model_is_not_served_only_if_every_server_says_so(others: list[RewardE
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("down_s", "kind"), [(0.1, DeadlineExceededError), (1.3, ServerUnavailableError)])
-def test_a_call_ends_with_what_took_most_of_its_time(down_s: float, kind: type[RewardError]) -> None:
+def test_a_call_out_of_time_raises_the_error_that_took_most_of_its_time(down_s: float, kind: type[RewardError]) -> None:
     """The server takes no connection at first, and is silent afterwards."""
     stand = Stand()
     stand.is_silent = True
@@ -225,7 +225,7 @@ def test_a_call_under_which_two_processes_end_fails(num_servers: int) -> None:
     assert sum(stand.asked["infer"] for stand in stands) == 2
 
 
-def test_what_a_server_says_of_a_model_is_asked_of_another_at_once() -> None:
+def test_model_info_is_asked_of_another_server_at_once_if_one_is_lost() -> None:
     stands = [Stand("grpc://one:1", lost()), Stand("grpc://other:1")]
     with RewardClient("", transports=stands) as client:
         assert client.model_info().versions == ("1",)

@@ -386,7 +386,9 @@ REFUSED: dict[str, tuple[dict[str, Any], Any, str]] = {
 
 
 @pytest.mark.parametrize(("given", "frame", "message"), REFUSED.values(), ids=REFUSED)
-def test_what_cannot_be_right_is_refused_with_its_environment(given: dict[str, Any], frame: Any, message: str) -> None:
+def test_invalid_episodes_and_frames_are_refused_with_their_environment(
+    given: dict[str, Any], frame: Any, message: str
+) -> None:
     with RewardClient("", transports=[Shelf(has_encoder=False)]) as client, pytest.raises(ValueError, match=message):
         episode = client.episode(**{"task": TASK, "env": 3, "frames": 4, **given})
         if frame is not None:

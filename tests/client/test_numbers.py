@@ -74,7 +74,7 @@ def test_a_number_may_be_numpy_s(give: Given, value: Any) -> None:
 
 
 @pytest.mark.parametrize("give", SHARES.values(), ids=SHARES)
-def test_percent_are_told_from_a_probability(give: Given) -> None:
+def test_a_threshold_in_percent_is_refused_with_the_probability_to_give(give: Given) -> None:
     with pytest.raises(
         ValueError, match=r"^threshold: expected a number from 0 to 1, got 80; for 80 percent give 0\.8$"
     ):

@@ -75,6 +75,6 @@ def test_the_colours_are_those_of_the_page_and_no_axes_are_boxed() -> None:
     ("num_results", "num_names", "message"),
     [(41, 41, "results: expected 1 to 40, got 41"), (1, 0, "names: expected 1, as many as results, got 0")],
 )
-def test_what_cannot_be_drawn_is_refused(num_results: int, num_names: int, message: str) -> None:
+def test_plots_of_too_many_results_or_too_few_names_are_refused(num_results: int, num_names: int, message: str) -> None:
     with pytest.raises(ValueError, match=f"^{message}$"):
         plot_scores([scores(2)] * num_results, ["a"] * num_names)

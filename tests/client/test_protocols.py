@@ -125,7 +125,7 @@ def test_closing_a_client_ends_its_calls_with_an_error_that_says_so(served: Serv
     assert "this RewardClient was closed during the call" in {str(error) for error in errors}
 
 
-def test_a_model_is_described_or_told_as_not_served(served: Served, protocol: str) -> None:
+def test_model_info_describes_a_served_model_and_refuses_one_not_served(served: Served, protocol: str) -> None:
     with served.client(protocol, FRAMES_MODEL) as client:
         info, frames = client.model_info(), client.model_info(frames=True)
     assert (info.name, info.versions, info.max_batch_size) == (FRAMES_MODEL, ("1",), 64)

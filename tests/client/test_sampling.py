@@ -113,7 +113,7 @@ REFUSED: dict[str, tuple[Any, ...]] = {
 
 
 @pytest.mark.parametrize(("rule", "frames", "message"), REFUSED.values(), ids=REFUSED)
-def test_what_no_rule_takes_is_refused(rule: Any, frames: int | None, message: str) -> None:
+def test_invalid_sampling_rules_and_frame_counts_are_refused(rule: Any, frames: int | None, message: str) -> None:
     with pytest.raises(ValueError, match=f"^{message}$"):
         Sampling(rule, frames)
 
@@ -182,7 +182,7 @@ def large(height: int, width: int) -> UInt8Array:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_rewind_s_encoder_reads_what_it_would_have_read_to_a_grey_level(size: tuple[int, int]) -> None:
+def test_resized_frames_reach_rewind_s_encoder_within_one_grey_level_of_the_originals(size: tuple[int, int]) -> None:
     frames = large(*size)
     read = ImagePreprocessor(256, (256, 256), (0.0,) * 3, (1 / 255,) * 3)
     resized = resize_frames(frames, FrameSize.parse("shortest 256"))

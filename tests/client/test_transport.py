@@ -108,7 +108,7 @@ def test_whatever_answers_the_error_is_ours(
     assert caught.value.may_have_ended_server is may_have_ended
 
 
-def test_a_redirect_is_told_and_never_followed() -> None:
+def test_a_redirect_is_an_error_and_never_followed() -> None:
     """It would carry frames and headers to an unknown server."""
     arrived: list[socket.socket] = []
     with listening(arrived.append) as other:
@@ -157,7 +157,7 @@ def grpc_server(service: str, method: str, handler: grpc.RpcMethodHandler) -> It
         server.stop(None)
 
 
-def test_triton_is_told_the_time_of_a_call_in_microseconds() -> None:
+def test_requests_to_triton_carry_the_timeout_of_the_call_in_microseconds() -> None:
     """Triton drops later requests from a queue exported with ``queue_timeout_ms``."""
     told_us: list[int] = []
 
@@ -176,7 +176,7 @@ def test_triton_is_told_the_time_of_a_call_in_microseconds() -> None:
     assert 0.5 * WITHIN_S < waits_us / 1e6 <= WITHIN_S
 
 
-def test_a_name_that_nobody_knows_is_told() -> None:
+def test_the_error_for_an_unknown_host_name_says_so() -> None:
     client = RewardClient("grpc://rfm-servers.invalid:8001", retry=False, timeout_s=WITHIN_S)
     with client, pytest.raises(RewardError, match=r"Domain name not found|resol|DNS"):
         client.model_info()

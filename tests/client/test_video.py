@@ -37,7 +37,7 @@ def test_a_video_is_read_whole_or_at_a_frame_rate(video: Path) -> None:
     np.testing.assert_array_equal(sampled, whole.positions[indices])
 
 
-def test_memory_is_told_before_it_is_taken(video: Path) -> None:
+def test_read_video_announces_memory_before_it_takes_it(video: Path) -> None:
     frame_bytes = clip.SIZE_PX**2 * 3
     told: list[int] = []
     frames = read_video(video, 1, take=told.append)
@@ -124,7 +124,7 @@ BAD_URLS = {
 
 
 @pytest.mark.parametrize(("path", "reason"), BAD_URLS.values(), ids=BAD_URLS)
-def test_a_url_that_fails_is_told_with_its_reason(video: Path, path: str, reason: str) -> None:
+def test_the_error_for_a_url_that_fails_has_the_reason(video: Path, path: str, reason: str) -> None:
     (video.parent / "text.mp4").write_text("no video")
     with serving(video.parent) as (url, _), pytest.raises(InvalidSampleError) as refused:
         load_trajectory(f"{url}/{path}")

@@ -168,19 +168,19 @@ def answer(command: str) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize(("command", "message"), USAGE.items(), ids=USAGE)
-def test_wrong_usage_is_told_in_the_words_of_the_command_line(command: str, message: str) -> None:
+def test_errors_of_wrong_usage_use_the_words_of_the_command_line(command: str, message: str) -> None:
     assert answer(command) == (2, f"Error: {message}")
 
 
 @pytest.mark.parametrize(("command", "told"), FAILURES.items(), ids=FAILURES)
-def test_what_cannot_be_done_is_told_with_what_was_found(command: str, told: tuple[int | str, ...]) -> None:
+def test_errors_of_impossible_commands_name_the_value_found(command: str, told: tuple[int | str, ...]) -> None:
     code, *message = told
     program = command.split()[0]
     assert answer(command) == (code, f"{program}: {''.join(map(str, message))}")
 
 
 @pytest.mark.parametrize(("words", "told"), AT_SERVER.items(), ids=AT_SERVER)
-def test_inputs_that_a_server_would_score_are_told(
+def test_unusable_inputs_are_refused_while_a_server_is_ready(
     engines: EngineServer, words: str, told: tuple[int | str, ...]
 ) -> None:
     code, *message = told

@@ -79,14 +79,14 @@ def test_parts_of_an_answer_are_of_one_version() -> None:
 
 
 @pytest.mark.parametrize("name", ["last_progress", "progress_deltas", "succeeded"])
-def test_what_a_checkpoint_does_not_predict_becomes_no_number(name: str) -> None:
+def test_a_score_that_a_checkpoint_does_not_predict_raises_an_error(name: str) -> None:
     nothing = np.full(2, np.nan, np.float32)
     scores = FrameScores(progress=nothing, success=nothing)
     with pytest.raises(ValueError, match="got NaN: this checkpoint does not predict it"):
         getattr(scores, name)() if name == "succeeded" else getattr(scores, name)
 
 
-def test_the_leading_score_is_progress_or_what_the_model_predicts_in_its_place() -> None:
+def test_the_leading_score_is_progress_or_the_score_predicted_in_its_place() -> None:
     assert seconds(3, 1).leading == "remaining_s"
     nothing = np.full(2, np.nan, np.float32)
     assert FrameScores(progress=nothing, success=nothing).leading == "progress"

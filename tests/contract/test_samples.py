@@ -131,7 +131,7 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
 
 
 @pytest.mark.parametrize(("make", "message"), BAD.values(), ids=BAD)
-def test_what_cannot_be_scored_cannot_be_made(make: Callable[[], Any], message: str) -> None:
+def test_invalid_samples_are_refused_on_construction(make: Callable[[], Any], message: str) -> None:
     with pytest.raises(InvalidSampleError) as caught:
         make()
     assert str(caught.value) == message
@@ -148,7 +148,7 @@ def test_float_frames_that_would_turn_black_are_refused(frames: np.ndarray) -> N
         float_frames_to_uint8(frames)
 
 
-def test_requests_of_two_frame_sizes_are_bounded_by_what_is_sent() -> None:
+def test_requests_of_two_frame_sizes_are_bounded_by_the_padded_bytes_sent() -> None:
     """The longest first and second trajectories may belong to different samples."""
     small, large = (np.zeros((9, height, 400, 3), np.uint8) for height in (100, 400))
     counts = [(1, 9), (9, 1), (5, 5), (2, 8), (8, 2), (1, 1)]

@@ -249,7 +249,9 @@ def test_numbers_that_mean_nothing_are_refused(tensors: wire.Tensors, message: s
 
 
 @pytest.mark.parametrize(("lengths", "is_refused"), [((1, 0), False), ((1, 1), False), ((0, 1), True), ((1, -1), True)])
-def test_the_encoder_reads_what_has_frames(lengths: tuple[int, int], is_refused: bool) -> None:
+def test_the_encoder_reads_videos_with_frames_and_refuses_other_frame_counts(
+    lengths: tuple[int, int], is_refused: bool
+) -> None:
     tensors = wire.encode_frames(filmed(0, 2)) | {"num_frames": np.array([lengths], np.int32)}
     tensors["frames"] = np.where(np.arange(2)[None, :, None, None, None] < sum(lengths), tensors["frames"], 0)
     if is_refused:

@@ -266,7 +266,9 @@ def test_a_gateway_asks_a_server_that_listens_everywhere_at_this_machine(
     assert options["--metrics-url"] == [f"http://{reached}:8002/metrics"]
 
 
-def test_a_gateway_takes_from_the_server_what_its_section_leaves_open(started: Any, tmp_path: Path, port: int) -> None:
+def test_a_gateway_takes_settings_missing_in_its_section_from_the_server_s(
+    started: Any, tmp_path: Path, port: int
+) -> None:
     ends = Endpoints.free()
     (tmp_path / "serve.yaml").write_text(
         f"export: {{name: rfm}}\nserve: {{http_port: {ends.http_port}, grpc_port: {ends.grpc_port}, "
@@ -303,13 +305,13 @@ WORDS: dict[str, tuple[str, str]] = {
 
 
 @pytest.mark.parametrize(("words", "message"), WORDS.values(), ids=WORDS)
-def test_what_is_missing_or_told_twice_is_named(words: str, message: str) -> None:
+def test_missing_and_conflicting_arguments_are_named(words: str, message: str) -> None:
     result = rfm(*words.split())
     assert result.exit_code == 2
     assert message in result.stderr
 
 
-def test_what_follows_two_dashes_goes_to_triton() -> None:
+def test_arguments_after_two_dashes_go_to_triton() -> None:
     free = Endpoints.free()
     ports = [f"--{name}-port={getattr(free, f'{name}_port')}" for name in ("http", "grpc", "metrics")]
     result = rfm("serve", *ports, REPOSITORY, "--", "--http-port=1")

@@ -74,7 +74,7 @@ def test_a_device_that_is_not_there_is_refused(free_bytes: list[float]) -> None:
         device_named("cuda:2")
 
 
-def test_a_lack_of_room_is_told_in_a_line() -> None:
+def test_a_lack_of_gpu_memory_is_reported_in_one_line() -> None:
     reason = "CUDA out of memory. Tried to allocate 8 GiB.\nMore"
     with pytest.raises(rfm_export.ExportError) as error, needing_room(torch.device("cuda", 0)):
         raise torch.OutOfMemoryError(reason)

@@ -50,7 +50,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return repository
 
 
-def test_an_export_holds_what_serving_needs_and_nothing_of_the_training_run(exported: Path) -> None:
+def test_an_export_holds_the_files_for_serving_and_none_of_the_training_run(exported: Path) -> None:
     files = {str(file.relative_to(exported)) for file in exported.rglob("*") if file.is_file()}
     assert {"rfm/1/model.py", "rfm/1/checkpoint/model.safetensors", "rfm/1/checkpoint/config.json"} <= files
     assert {"video_encoder/1/image_encoder/model.safetensors", "video_encoder/1/text_encoder/tokenizer.json"} <= files
@@ -147,7 +147,9 @@ RUNS: dict[str, tuple[str, object, str]] = {  # setting, value, and what is said
 
 
 @pytest.mark.parametrize(("setting", "value", "expected"), RUNS.values(), ids=RUNS)
-def test_an_export_says_what_the_run_did_not_train(tmp_path: Path, setting: str, value: object, expected: str) -> None:
+def test_an_export_notes_settings_of_the_run_that_change_the_meaning_of_scores(
+    tmp_path: Path, setting: str, value: object, expected: str
+) -> None:
     checkpoint = shutil.copytree(EMBEDDINGS.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
     run = training_run(EMBEDDINGS.checkpoint.parent / "config.yaml")
     run["model"] |= {f"train_{head}_head": True for head in HEADS}
@@ -221,7 +223,9 @@ def test_models_tell_their_weights_by_the_files_digest(exported: Path) -> None:
 
 
 @pytest.mark.parametrize("file", ["text_encoder/model.safetensors", "image_encoder/preprocessor_config.json"])
-def test_check_names_what_differs_also_by_other_weights_and_settings(exported: Path, tmp_path: Path, file: str) -> None:
+def test_check_names_missing_and_differing_files_also_by_other_weights_and_settings(
+    exported: Path, tmp_path: Path, file: str
+) -> None:
     repository = shutil.copytree(exported, tmp_path / "repository")
     changed = repository / "video_encoder" / "1" / file
     changed.write_bytes(changed.read_bytes() + b"\n")
@@ -234,7 +238,7 @@ def test_check_names_what_differs_also_by_other_weights_and_settings(exported: P
     ]
 
 
-def test_the_digest_of_settings_is_of_the_dtype_too_and_clients_learn_what_computes(
+def test_the_digest_of_settings_covers_the_dtype_and_clients_learn_the_computation(
     exported: Path, tmp_path: Path
 ) -> None:
     export(FRAMES, tmp_path, name="video", dtype="bfloat16")
@@ -255,7 +259,7 @@ def test_a_set_size_of_batches_wins_also_in_the_check(tmp_path: Path) -> None:
     assert rfm_export.check(tmp_path, replace(settings, max_batch_size=None))  # 64
 
 
-def test_a_checkpoint_of_the_hub_tells_its_commit(tmp_path: Path) -> None:
+def test_the_origin_of_a_checkpoint_of_the_hub_has_its_commit(tmp_path: Path) -> None:
     snapshot = tmp_path / "models--org--name" / "snapshots" / "0123abcd"
     assert origin_of("org/name@best", snapshot, "") == Origin(
         source="org/name@best", revision="0123abcd", computation=""

@@ -77,7 +77,7 @@ def test_the_scorers_configuration_is_the_wire_contract() -> None:
     assert [warmup.name for warmup in config.model_warmup] == ["progress", "preference", "similarity"]
 
 
-def test_a_checkpoint_is_asked_for_what_it_has() -> None:
+def test_a_model_s_config_has_only_outputs_and_warmups_that_its_checkpoint_supports() -> None:
     config = models(goldens.config("legacy_keys_l2"), max_queue_size=7, queue_timeout_ms=250)["rfm"]
     assert "progress_logits" not in dims(config.output)
     # by default the queue is not bounded: with a bound, Triton 2.51 at times notices a free instance half a second late

@@ -79,7 +79,7 @@ KEYS: dict[str, tuple[str, list[str], object]] = {
 
 
 @pytest.mark.parametrize(("setting", "case"), KEYS.items(), ids=KEYS)
-def test_what_config_yaml_does_not_say_is_assumed_aloud(
+def test_settings_missing_in_config_yaml_are_assumed_with_a_note(
     vlm: Copy, setting: str, case: tuple[str, list[str], object]
 ) -> None:
     name, keys, default = case
@@ -92,7 +92,7 @@ def test_what_config_yaml_does_not_say_is_assumed_aloud(
     assert notes(folder, base) == [f"{TOLD}{expected}; scores differ from the run's if it had others"]
 
 
-def test_a_setting_without_effect_is_not_told(vlm: Copy) -> None:
+def test_a_missing_setting_without_effect_gives_no_note(vlm: Copy) -> None:
     folder, base = vlm(PLAIN)
     for key in ("frame_pooling", "frame_pooling_attn_temperature", "average_temporal_patches"):
         rewritten(folder / "config.yaml", lambda run, key=key: run["model"].pop(key, None))
@@ -158,7 +158,7 @@ CONTRADICTIONS: dict[str, tuple[str, str, object, str]] = {
 
 
 @pytest.mark.parametrize(("file", "key", "value", "expected"), CONTRADICTIONS.values(), ids=CONTRADICTIONS)
-def test_a_processor_that_is_not_the_published_one_is_refused_or_told_of_a_run_s_own(
+def test_a_processor_unlike_the_published_one_is_refused_or_noted_if_the_run_names_it(
     vlm: Copy, file: str, key: str, value: Any, expected: str
 ) -> None:
     folder, base = vlm(PLAIN)

@@ -51,7 +51,9 @@ def as_any_user(folder: Path) -> Iterator[None]:
         os.seteuid(user)
 
 
-def test_a_file_that_may_not_be_read_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_without_read_permission_is_refused_with_that_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     folder = copied(SMALL, Path("checkpoint"))
     (folder / "config.json").chmod(0)
@@ -78,7 +80,7 @@ def test_only_the_repository_must_be_writable(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("room", [0, 100, (SMALL.checkpoint / WEIGHTS).stat().st_size // 2])
-def test_a_full_disk_is_told_and_changes_nothing(tmp_path: Path, room: int) -> None:
+def test_an_export_to_a_full_disk_fails_with_a_message_and_changes_nothing(tmp_path: Path, room: int) -> None:
     """Be it full at once, behind a small file, or in the middle of the weights."""
     repository = tmp_path / "model_repository"
     export(repository)
@@ -108,7 +110,7 @@ NO_REPOSITORY: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize(("make", "message"), NO_REPOSITORY.values(), ids=NO_REPOSITORY)
-def test_an_export_into_what_takes_none_is_told(
+def test_an_export_into_an_unusable_folder_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Callable[[Path], object], message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -122,7 +124,7 @@ def changed_at(folder: Path) -> dict[Path, int]:
     return {file: file.stat().st_mtime_ns for file in folder.rglob("*") if file.is_file()}
 
 
-def test_two_exports_at_a_time_are_one_too_many_and_the_next_removes_what_a_killed_one_left(tmp_path: Path) -> None:
+def test_a_second_export_at_a_time_is_refused_and_the_next_removes_remains_of_a_killed_one(tmp_path: Path) -> None:
     """It touches no file of another model, which would make Triton load that again, too."""
     repository = tmp_path / "model_repository"
     for name in ("another", "rfm"):
@@ -190,7 +192,7 @@ def test_an_export_that_dies_at_any_moment_leaves_a_repository_that_loads(
 
 
 @pytest.mark.triton
-def test_triton_does_not_see_what_is_staged(served: Served) -> None:
+def test_triton_does_not_see_staged_models(served: Served) -> None:
     """Nor the remains of a killed export."""
     with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
         before = {entry.name for entry in api.index()}

@@ -103,7 +103,7 @@ def test_batches_that_are_collated_while_others_are_scored_have_the_cpu_s_scores
     assert {"pin_memory", "stream", "wait_stream", "record_stream"} <= {*seen.calls}
 
 
-def test_a_thread_that_computes_is_told_its_device(seen: Seen) -> None:
+def test_a_computing_thread_sets_its_cuda_device(seen: Seen) -> None:
     Placement(CUDA, 1).apply()
     Placement(torch.device("cpu"), 1).apply()
     assert seen.calls == ["set_device"]

@@ -178,7 +178,7 @@ def saved(encoders: Encoders, folder: Path, file: str, change: Callable[[dict[st
 IMAGES = f"image_encoder/{PREPROCESSOR_CONFIG}"
 
 
-def test_what_is_saved_is_the_same_also_with_sizes_as_transformers_once_wrote_them(
+def test_saved_encoders_load_the_same_also_with_sizes_as_transformers_once_wrote_them(
     encoders: Encoders, tmp_path: Path
 ) -> None:
     copy = Encoders.load(saved(encoders, tmp_path, IMAGES, lambda content: content.update(size=64, crop_size=56)))

@@ -154,7 +154,7 @@ NO_FAMILY = {
 
 
 @pytest.mark.parametrize(("family", "message"), NO_FAMILY.values(), ids=NO_FAMILY)
-def test_what_is_no_family_s_is_refused(checkpoint: Path, family: str | None, message: str) -> None:
+def test_a_checkpoint_of_no_known_family_is_refused(checkpoint: Path, family: str | None, message: str) -> None:
     with pytest.raises(CheckpointError, match=message):
         published.load(checkpoint, family=family)
 

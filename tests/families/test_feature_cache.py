@@ -86,7 +86,7 @@ def test_a_frame_that_is_evicted_after_its_request_came_is_not_missing(encoders:
     assert (execution.num_encoded, execution.num_found) == (0, 3)
 
 
-def test_nobody_can_say_what_a_digest_shows(encoders: FrameEncoders) -> None:
+def test_frame_digests_given_by_a_caller_do_not_count(encoders: FrameEncoders) -> None:
     """Pixels are named by who reads them: a digest that a caller gives them counts for nothing."""
     frames, cache = frames_of(4, 2), FeatureCache(2**20)
     with pytest.raises(
@@ -99,7 +99,7 @@ def test_nobody_can_say_what_a_digest_shows(encoders: FrameEncoders) -> None:
     np.testing.assert_allclose(embeddings(outcome)[0], embeddings(expected)[0], atol=1e-5)
 
 
-def test_what_is_not_finite_is_not_kept() -> None:
+def test_features_that_are_not_finite_are_not_cached() -> None:
     cache = FeatureCache(2**20)
     sources = {b"nan": np.float32(np.nan), b"error": np.float32(0), b"good": np.float32(1)}
 
@@ -126,7 +126,7 @@ def test_memory_is_bounded_whatever_comes() -> None:
     assert not cache.found([bytes(32)])
 
 
-def test_what_was_used_last_stays() -> None:
+def test_the_most_recently_used_features_stay_in_the_cache() -> None:
     cache = FeatureCache(3 * (64 * 4 + 256))
     features = {bytes([number]): np.zeros(64, np.float32) for number in range(4)}
     for number in range(3):

@@ -92,7 +92,9 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("source", "message"), REFUSED.values(), ids=REFUSED)
-def test_the_refusal_names_what_a_hub_s_repository_lacks(from_hub: dict[str, Any], source: str, message: str) -> None:
+def test_the_refusal_of_an_unusable_hub_repository_names_the_fault(
+    from_hub: dict[str, Any], source: str, message: str
+) -> None:
     assert re.search(message, from_hub[source]), from_hub[source]
 
 

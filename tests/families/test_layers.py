@@ -81,7 +81,7 @@ def test_large_float32_products_without_gradients_are_onednns(monkeypatch: pytes
 
 
 @pytest.mark.parametrize("options", [{}, {"relu": True}, {"plus": torch.zeros(64, 256)}], ids=["", "relu", "plus"])
-def test_what_is_no_number_stays_none(options: dict[str, Any]) -> None:
+def test_nan_and_infinite_weights_give_nan_products(options: dict[str, Any]) -> None:
     """Or a broken weight would give finite scores, which are wrong."""
     for weight_value, bias_value in ((float("nan"), 0.0), (0.0, float("nan")), (float("inf"), float("-inf"))):
         weight, bias = torch.zeros(256, 512), torch.zeros(256)

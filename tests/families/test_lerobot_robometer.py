@@ -55,7 +55,7 @@ def test_scores_are_those_of_lerobot(case: Reference) -> None:
             np.testing.assert_allclose(got, expected[: len(got)], rtol=0, atol=TOLERANCES[0])
 
 
-def test_an_export_scores_the_same_and_assumptions_are_told(tmp_path: Path) -> None:
+def test_an_export_scores_the_same_and_its_assumptions_are_listed(tmp_path: Path) -> None:
     case = next(case for case in CASES if case.config == CHECKPOINT.parent)
     loaded = published.read(CHECKPOINT, base_model=str(BASE))
     loaded.checkpoint.save(tmp_path / "saved")

@@ -53,7 +53,7 @@ def pair(name: str) -> tuple[Trajectory, Trajectory]:
 
 @pytest.mark.parametrize("heads", LACKS, ids="-".join)
 @pytest.mark.parametrize("name", [REWIND, VLM])
-def test_what_is_there_is_scored_as_with_all_heads_and_the_rest_refused_alone(
+def test_present_heads_score_as_with_all_heads_and_samples_of_missing_ones_are_refused(
     tmp_path: Path, name: str, heads: tuple[str, ...]
 ) -> None:
     folder = without(name, heads, tmp_path / "checkpoint")
@@ -77,7 +77,7 @@ def test_what_is_there_is_scored_as_with_all_heads_and_the_rest_refused_alone(
 
 
 @pytest.mark.parametrize("name", [REWIND, VLM])
-def test_what_is_exported_has_the_same_heads(tmp_path: Path, name: str) -> None:
+def test_an_exported_checkpoint_has_the_same_heads(tmp_path: Path, name: str) -> None:
     folder = without(name, ["preference", "success"], tmp_path / "checkpoint")
     settings = replace(serve_config(goldens.config(name)), token_budget=4096)
     number = rfm_export.export(folder, tmp_path / "repository", settings)

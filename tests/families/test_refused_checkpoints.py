@@ -461,7 +461,7 @@ def test_a_model_with_reward_heads_is_not_asked_in_words() -> None:
 @pytest.mark.parametrize(
     "source", ["/no/such/folder", "a/b/../c", "a/b@", "", "org/..", "..@tag", "a" * 5000, "~nobody-here/x/y", "a\0b"]
 )
-def test_what_is_neither_folder_nor_id_is_refused(source: str) -> None:
+def test_a_source_that_is_neither_folder_nor_id_is_refused(source: str) -> None:
     with pytest.raises(CheckpointError, match="expected a folder that exists or a Hugging Face id"):
         published.load(source)
 

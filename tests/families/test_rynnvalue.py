@@ -217,7 +217,7 @@ def test_descriptions_that_do_not_fit_the_prompt_are_refused(
         _ = published.load(checkpoint, **options).collator
 
 
-def test_missing_settings_are_assumed_and_unexpected_keys_told(copied: Path) -> None:
+def test_missing_settings_are_assumed_and_unexpected_keys_are_noted(copied: Path) -> None:
     in_json("config.json", lambda config: config.pop("attn_implementation"))(copied)
     settings("config.json", success_head_config={})(copied)
     in_json("config.json", lambda config: config["value_head_config"].update(dropout=0.1))(copied)

@@ -144,7 +144,7 @@ def test_whole_videos_of_other_callers_fill_the_cache(name: str) -> None:
     assert_scored(ask(cached, first.positions, (), 3), plain, first.positions, 3)
 
 
-def test_the_size_that_frames_are_brought_to_is_part_of_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cached_frames_of_one_size_are_not_used_for_another_size(monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames of very long videos are downscaled more."""
     cached, plain = of_both(MODELS[3])
     frames = frames_of(6, 4, (448, 336))
@@ -157,7 +157,7 @@ def test_the_size_that_frames_are_brought_to_is_part_of_what_is_kept(monkeypatch
 
 
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
-def test_what_is_not_finite_is_not_kept_even_if_no_score_shows_it(name: str) -> None:
+def test_frames_that_are_not_finite_are_not_cached_even_if_no_score_shows_it(name: str) -> None:
     """The last tokens of a video may follow all positions that are read."""
     cache, frames = FeatureCache[Any](BYTES_PER_MIB), frames_of(12, 4)
     cached = engine(name, cache)
@@ -214,7 +214,7 @@ def test_frames_that_were_evicted_are_kept_again_though_all_their_shots_are_kept
     assert execution.num_encoded == 0
 
 
-def test_what_is_kept_holds_on_to_no_request() -> None:
+def test_cached_frames_keep_no_request_in_memory() -> None:
     """A cached view would keep a whole large request in memory."""
     cache, frames = FeatureCache[Any](BYTES_PER_MIB), frames_of(10, 3)
     ask(engine(MODELS[0], cache), frames, frames)

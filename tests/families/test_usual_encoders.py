@@ -57,7 +57,7 @@ def test_an_encoder_as_wide_as_upstream_s_is_compared(
     assert usual.differences(facts(str(tmp_path))) == expected
 
 
-def test_encoders_that_are_not_upstream_s_are_told(tmp_path: Path) -> None:
+def test_encoders_that_differ_from_upstream_s_are_noted(tmp_path: Path) -> None:
     from transformers import AutoModel, BertConfig, Dinov2Config
 
     image, text = tmp_path / "image", tmp_path / "text"

@@ -400,7 +400,7 @@ def test_a_configuration_without_the_tokens_of_a_second_has_those_of_transformer
     assert usual != backbone["vision_config"]["tokens_per_second"]
 
 
-def test_a_tokenizer_adds_nothing_to_what_the_chat_template_says() -> None:
+def test_a_tokenizer_adds_no_special_tokens_to_the_chat_template_s_text() -> None:
     """It writes all there is to be; the tokenizers of the references have nothing to add."""
     collator, sample = predictor_of(PLAIN).collator, ProgressSample(video(0, 2, 64, 64))
     (expected,) = collator.rows(sample)

@@ -85,7 +85,7 @@ def test_a_checkpoint_in_another_form_scores_the_same(
         (PLAIN, "5.5.4", False),
     ],
 )
-def test_a_video_run_of_transformers_5_is_told_about_its_positions(
+def test_a_video_run_of_transformers_5_gets_a_note_about_its_positions(
     copied: Callable[[str], Path], name: str, version: str, is_told: bool
 ) -> None:
     folder = copied(name)
@@ -121,7 +121,7 @@ def test_a_processor_of_transformers_5_reads_the_same(tmp_path: Path, name: str)
         assert_close(scores(folder, name, base_model=str(base)), expected, 1e-6)
 
 
-def test_fields_that_an_old_upstream_did_not_have_are_what_it_did(copied: Callable[[str], Path]) -> None:
+def test_fields_that_an_old_upstream_lacked_default_to_its_behaviour(copied: Callable[[str], Path]) -> None:
     folder = copied("q25_video_last_l2")
     (folder / "config.yaml").write_text(
         "model: {base_model_id: some/base}\ndata: {resized_height: 56, resized_width: 84}\n"
@@ -134,7 +134,7 @@ def test_fields_that_an_old_upstream_did_not_have_are_what_it_did(copied: Callab
 
 
 @pytest.mark.parametrize("section", ["model", "data"])
-def test_either_section_tells_how_frames_are_shown(copied: Callable[[str], Path], section: str) -> None:
+def test_frame_settings_are_read_from_either_section(copied: Callable[[str], Path], section: str) -> None:
     folder = copied(PLAIN)
     in_yaml(lambda run: [run[section].pop(key) for key in TWICE])(folder)
     assert load(PLAIN, folder).config == load(PLAIN).config
@@ -150,7 +150,9 @@ IGNORED = {
 
 
 @pytest.mark.parametrize(("name", "change"), IGNORED.values(), ids=IGNORED)
-def test_what_upstream_ignores_changes_no_score(copied: Callable[[str], Path], name: str, change: Spoil) -> None:
+def test_settings_that_upstream_ignores_change_no_score(
+    copied: Callable[[str], Path], name: str, change: Spoil
+) -> None:
     folder = copied(name)
     change(folder)
     (expected,) = load_engine(name).evaluate([SAMPLE])

@@ -217,7 +217,7 @@ def test_a_refusal_is_a_line_with_status_caller_reason_and_request_id(caplog: py
         assert " WARNING " in head
 
 
-def test_what_triton_fails_is_a_line_and_refused_evaluations_are_counted_with_their_id(
+def test_a_failure_of_triton_is_logged_and_refused_evaluations_are_counted_with_their_id(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     reasons = {"unavailable": {}, "host": {"Host": FOREIGN[0]}, "origin": {"Origin": LAB}}

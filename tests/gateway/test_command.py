@@ -84,7 +84,7 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize(("module", "command"), COMMANDS.items())
-def test_a_gateway_that_is_not_installed_is_told_with_the_command_that_installs_it(
+def test_without_the_gateway_s_packages_the_command_that_installs_it_is_printed(
     module: str, command: tuple[str, str]
 ) -> None:
     program = WITHOUT_GATEWAY.format(words=command[0].split(), module=module)
@@ -114,7 +114,7 @@ OF_TRITON = {
 
 
 @pytest.mark.parametrize(("error", "remedy"), OF_TRITON.values(), ids=OF_TRITON)
-def test_a_fault_of_triton_tells_a_caller_who_can_mend_it_and_no_option_of_the_client(
+def test_a_fault_of_triton_is_answered_with_who_can_mend_it_and_no_option_of_the_client(
     monkeypatch: pytest.MonkeyPatch, error: ServerError, remedy: str
 ) -> None:
     async def failing(_: TritonState) -> None:
@@ -147,7 +147,7 @@ def test_every_line_about_a_failed_request_names_it(
 GATEWAY, INSTALL = ("gateway", "--triton", NO_TRITON), "pip install ./client ./apps/gateway ./apps/page"
 
 
-def test_the_log_says_that_there_is_no_page_if_one_is_wanted(
+def test_without_rfm_page_the_log_says_so_if_a_page_is_wanted(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(mounting, "entry_points", lambda group: ())

@@ -143,7 +143,7 @@ ENDLESS = {
 
 
 @pytest.mark.parametrize("sent", ENDLESS.values(), ids=ENDLESS)
-def test_what_has_no_end_is_cut_off(strict: Address, sent: bytes) -> None:
+def test_endless_headers_trailers_and_chunk_extensions_are_cut_off(strict: Address, sent: bytes) -> None:
     with strict.dial() as peer, suppress(ConnectionError):
         peer.sendall(sent)
         while peer.recv(65536):

@@ -208,7 +208,7 @@ def listens(gateway: Gateway) -> bool:
         return probe.connect_ex(("127.0.0.1", int(gateway.url.rpartition(":")[2]))) == 0
 
 
-def test_a_gateway_asks_triton_over_http_and_answers_what_it_has_begun_when_it_is_told_to_stop(
+def test_a_gateway_asks_triton_over_http_and_answers_open_requests_before_it_stops(
     triton: Triton, tmp_path: Path
 ) -> None:
     body = dumped([progress(FIRST)]).encode()

@@ -98,7 +98,7 @@ def test_the_devices_are_busy_while_a_request_waits(triton: Triton, monkeypatch:
     assert told == (0, 1, "processing")
 
 
-def test_model_info_tells_the_checkpoint_and_its_training_run(
+def test_model_info_describes_the_checkpoint_and_its_training_run(
     tiny: Gateway, encoders: Gateway, tiny_network: torch.nn.Module
 ) -> None:
     info = requests.get(f"{tiny.url}/model_info").json()
@@ -124,7 +124,7 @@ def test_model_info_tells_the_checkpoint_and_its_training_run(
     assert requests.get(f"{encoders.url}/model_info").json()["experiment_config"] == json.loads(json.dumps(run))
 
 
-def test_metrics_count_what_was_asked(tiny: Gateway) -> None:
+def test_metrics_count_requests_and_samples(tiny: Gateway) -> None:
     def counts() -> list[float]:
         return [
             tiny.metric("requests_total", endpoint="/evaluate_batch", code="200"),

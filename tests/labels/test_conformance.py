@@ -217,7 +217,7 @@ def test_episodes_have_their_numbers_tasks_and_frames(tmp_path: Path, write: Cal
 
 @pytest.mark.slow
 @every_format
-def test_each_frame_gets_its_label_and_a_second_run_scores_what_is_missing(
+def test_each_frame_gets_its_label_and_a_second_run_scores_only_missing_episodes(
     tmp_path: Path, output: Path, write: Callable[[Path], Written]
 ) -> None:
     _, dataset = written(write, tmp_path)

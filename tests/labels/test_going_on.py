@@ -53,7 +53,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
 
 
 @pytest.mark.slow
-def test_a_process_that_is_killed_again_and_again_leaves_what_is_finished(
+def test_a_process_that_is_killed_again_and_again_keeps_its_finished_parts(
     output: Path, undisturbed: list[bytes]
 ) -> None:
     for how in (signal.SIGKILL, signal.SIGINT, signal.SIGKILL):

@@ -383,7 +383,7 @@ NOTES: dict[str, tuple[Callable[[Any], object], list[str]]] = {
 
 
 @pytest.mark.parametrize(("change", "lines"), NOTES.values(), ids=NOTES)
-def test_notes_list_what_is_left_out_and_the_rest_is_labelled(
+def test_notes_list_omitted_parts_and_the_rest_is_labelled(
     three: Path, change: Callable[[Any], object], lines: list[str]
 ) -> None:
     notes = Notes()

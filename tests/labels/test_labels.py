@@ -94,7 +94,7 @@ def test_triton_and_the_engine_score_each_frame_on_its_prefix_and_tell_successes
 
 @pytest.mark.slow
 @pytest.mark.triton
-def test_all_of_a_causal_network_in_one_pass_is_what_its_prefixes_give(client: RewardClient, output: Path) -> None:
+def test_one_pass_of_a_causal_network_gives_the_scores_of_its_prefixes(client: RewardClient, output: Path) -> None:
     dataset = open_dataset(LEROBOT / "toy_v21")
     short = [episode.index for episode in dataset.episodes if episode.num_frames <= 32]
     options = LabelOptions(output=output, cameras=(FRONT,), sampling="all", episodes=short)

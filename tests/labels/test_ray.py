@@ -75,7 +75,7 @@ def test_the_options_of_a_server_with_tls_reach_an_actor(tmp_path: Path) -> None
 
 
 @pytest.mark.nightly  # a minute
-def test_a_cluster_goes_on_without_a_node_that_is_killed_and_one_machine_with_what_it_has_left(
+def test_a_cluster_goes_on_without_a_killed_node_and_one_machine_labels_the_rest(
     output: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import ray

@@ -40,13 +40,13 @@ def test_the_dockerfile_is_clean() -> None:
     assert (done.returncode, done.stdout) == (0, "")
 
 
-def test_the_context_is_what_the_dockerfile_copies() -> None:
+def test_the_build_context_is_exactly_the_files_that_the_dockerfile_uses() -> None:
     used = {source for sources, _ in COPIED.findall(DOCKERFILE) for source in sources.split()}
     used |= {source for source, _ in MOUNTED.findall(DOCKERFILE)}
     assert sorted(used) == sorted(re.findall(r"^!(.+)$", (ROOT / ".dockerignore").read_text(), re.MULTILINE))
 
 
-def test_the_lock_has_what_the_packages_need_in_the_versions_of_the_constraints_with_hashes() -> None:
+def test_the_lock_has_all_needed_packages_in_the_versions_of_the_constraints_with_hashes() -> None:
     text = (DOCKER / "requirements.txt").read_text()
     locked = pins(DOCKER / "requirements.txt")
     assert locked

@@ -95,7 +95,7 @@ def proxy(nginx: str, folder: Path, ports: dict[str, int]) -> Iterator[None]:
 
 @pytest.mark.nightly
 @pytest.mark.triton
-def test_nginx_passes_on_what_scoring_needs_with_a_key_and_nothing_else(nginx: str, papers: Path) -> None:
+def test_nginx_passes_on_the_requests_that_scoring_needs_with_a_key_and_nothing_else(nginx: str, papers: Path) -> None:
     repository = shutil.copytree(ROOT / "model_repository", papers / "my_models")
     gateway, authority = Endpoints.free().http_port, papers / "keys" / "ca.pem"
     alice, bob = ((papers / "keys" / f"{name}.key").read_text().strip() for name in ("alice", "bob"))
@@ -150,7 +150,7 @@ def test_nginx_passes_on_what_scoring_needs_with_a_key_and_nothing_else(nginx: s
     assert not {key for key in (alice, bob) if key in log}
 
 
-def test_nginx_tells_triton_that_no_body_is_a_form(nginx: str, papers: Path) -> None:
+def test_nginx_passes_bodies_sent_as_forms_to_triton_as_octet_streams(nginx: str, papers: Path) -> None:
     """With a stand-in for Triton."""
 
     class Told(Quiet, BaseHTTPRequestHandler):
@@ -192,7 +192,7 @@ def test_keys_are_for_their_readers_alone_made_once_and_taken_back_one_by_one(pa
     assert keys.read_text() == before.splitlines(keepends=True)[1]
 
 
-def test_the_unit_runs_what_nginx_and_the_guide_expect() -> None:
+def test_the_systemd_unit_runs_rfm_serve_as_nginx_and_the_guide_expect() -> None:
     parser = configparser.RawConfigParser(strict=False)
     parser.read(ROOT / "docker" / "systemd" / "rfm-serve.service")
     program, name, *arguments = shlex.split(parser["Service"]["execstart"])

@@ -46,7 +46,7 @@ QUERIES = [target["expr"] for panel in DASHBOARD["panels"] for target in panel.g
 
 
 @pytest.mark.parametrize("name", ["recording", "alerts"])
-def test_rules_do_on_made_up_series_what_they_should(promtool: str, name: str) -> None:
+def test_prometheus_rules_pass_their_tests_on_made_up_series(promtool: str, name: str) -> None:
     for words in (
         ["check", "config", PROMETHEUS / "prometheus.yml"],
         ["test", "rules", PROMETHEUS / "tests" / f"{name}.yml"],
@@ -55,7 +55,7 @@ def test_rules_do_on_made_up_series_what_they_should(promtool: str, name: str) -
         assert done.returncode == 0, done.stdout
 
 
-def test_every_alert_says_what_to_do() -> None:
+def test_every_alert_has_a_severity_and_a_runbook() -> None:
     for rule in (rule for rule in RULES if "alert" in rule):
         assert rule["labels"]["severity"] in ("critical", "warning")
         assert {"summary", "description", "runbook_url"} == rule["annotations"].keys()
@@ -63,7 +63,7 @@ def test_every_alert_says_what_to_do() -> None:
         assert f"\n### {rule['alert']}\n" in RUNBOOKS.read_text()
 
 
-def test_every_metric_of_the_rules_and_the_dashboard_is_told(served: Served) -> None:
+def test_every_metric_of_the_rules_and_the_dashboard_is_exposed(served: Served) -> None:
     """By Triton with the models, ``rfm serve`` or the gateway."""
     with inside() as gateway:
         told = httpx.get(served.endpoints.metrics_url).text + Status().metrics().decode() + gateway.get("/metrics").text

@@ -87,7 +87,7 @@ for datasets in ((), ("demonstrations",)):
 
 
 @pytest.mark.slow
-def test_without_the_package_of_datasets_the_page_shows_none_and_says_what_to_install() -> None:
+def test_without_rfm_labels_the_page_shows_no_datasets_and_names_the_package_to_install() -> None:
     done = subprocess.run([sys.executable, "-c", WITHOUT_LABELS], capture_output=True, text=True, check=False)
     assert done.stdout == "shows\n"
     assert "dataset: expected the package rfm_labels" in done.stderr

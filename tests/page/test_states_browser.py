@@ -104,7 +104,7 @@ def test_a_page_goes_on_without_a_reload_when_triton_a_key_and_a_broken_dataset_
         assert not browser.all("#dataset-errors .state")
 
 
-def test_nothing_to_show_says_what_to_do(browser: Browser, tmp_path: Path) -> None:
+def test_a_page_with_nothing_to_show_gives_a_command_to_run(browser: Browser, tmp_path: Path) -> None:
     """Of the demo's models ``rfm`` alone scores no frames; one dataset has no episodes, one no cameras, one a depth map."""
     shutil.copytree(ROOT / "model_repository" / "rfm", tmp_path / "models" / "rfm")
     empty, bare = large(tmp_path / "empty", 0), large(tmp_path / "bare", 3)

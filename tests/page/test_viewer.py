@@ -83,7 +83,7 @@ def test_points_come_before_the_last_one_is_scored(encoders: Gateway, videos: Pa
     assert counts == [1, 2, 4, 8, 16, 1]
 
 
-def test_a_caller_who_leaves_frees_what_the_curve_holds(encoders: Gateway, videos: Path) -> None:
+def test_a_caller_who_leaves_stops_the_scoring_of_the_curve(encoders: Gateway, videos: Path) -> None:
     answered = encoders.metric("samples_total", sample_type="progress")
     with post(encoders.url, SCORE, {"video": videos / "clip.mp4"}, fps="10", frames="16", **QUESTION) as response:
         assert next(response.iter_lines()) == b"event: video"

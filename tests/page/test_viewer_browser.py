@@ -138,7 +138,7 @@ def picture(page: Page) -> Image.Image:
     return shown.crop((left, top, right + 1, bottom + 1))
 
 
-def test_a_person_sees_what_the_model_sees(page: Page) -> None:
+def test_the_page_shows_frames_corrected_as_the_model_gets_them(page: Page) -> None:
     frames = make_clip("success", Task("red", "bowl"), 2_000_000).frames[:, :40]
     clip.write(page.videos / "wide.mp4", frames, FPS)
     Select(page.browser["orient"]).select_by_value("rotate90")
@@ -229,7 +229,7 @@ def test_a_pair_is_compared_in_both_orders(page: Page) -> None:
     assert page.saved()["comparisons"] == []
 
 
-def test_what_is_missing_or_broken_is_named_and_the_others_are_scored(page: Page) -> None:
+def test_a_missing_task_or_a_broken_video_is_named_and_the_others_are_scored(page: Page) -> None:
     submit = page.browser.all("#question .first")[0]
     assert not submit.is_enabled()
     page.browser.write("tasks", " ")
@@ -353,7 +353,7 @@ def test_tasks_are_overlaid_colours_tell_videos_apart_and_lines_tell_tasks_apart
     assert [video["source"] for video in page.saved()["videos"]] == ["success.mp4", "failure.mp4"]  # the files' names
 
 
-def test_a_slow_upload_tells_how_far_it_is_and_then_the_curve_comes(page: Page) -> None:
+def test_a_slow_upload_shows_its_percentage_and_then_the_curve(page: Page) -> None:
     link = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": 20_000}  # bytes a second
     page.browser.driver.execute_cdp_cmd("Network.enable", {})
     page.browser.driver.execute_cdp_cmd("Network.emulateNetworkConditions", link)

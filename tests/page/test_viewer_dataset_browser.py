@@ -200,7 +200,7 @@ def tick(page: Page, name: str, number: float | None = None) -> None:
     page.browser[f"only-{name}"].click()
 
 
-def test_filters_keep_what_they_say_and_tell_how_many(page: Page) -> None:
+def test_filters_keep_the_matching_episodes_and_show_their_number(page: Page) -> None:
     dataset = page.choose(DEMO)
     summary = summarise(page.folders[DEMO] / "rfm_progress.parquet")
     assert summary.best_success is not None and summary.disagreement is not None
@@ -399,7 +399,7 @@ return [...document.querySelectorAll("#curves tr:first-child td")].map((cell) =>
 
 
 @pytest.mark.parametrize("size", [(1440, 900), (1024, 700), (390, 844)], ids=str)
-def test_what_one_looks_at_fits_into_the_window_and_breaks_no_rule_of_axe_in_either_theme(
+def test_the_tabs_fit_into_the_window_and_break_no_rule_of_axe_in_either_theme(
     page: Page, size: tuple[int, int]
 ) -> None:
     def fits(*, axe: bool = False) -> None:
@@ -482,7 +482,7 @@ def test_a_link_shows_a_colleague_the_same_episode_and_settings(page: Page) -> N
     page.has(link)
 
 
-def test_a_dead_link_says_so_and_shows_what_is_there(page: Page) -> None:
+def test_a_dead_link_shows_a_message_and_other_episodes_can_still_be_watched(page: Page) -> None:
     for link, title in (
         ("#tab=dataset&dataset=gone", "The dataset gone is not shown here"),
         (f"{FIRST}&episode=99", "Episode 99 is not shown here"),

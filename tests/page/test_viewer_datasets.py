@@ -218,7 +218,7 @@ UNKNOWN = {
 
 
 @pytest.mark.parametrize(("path", "message"), UNKNOWN.items())
-def test_what_is_not_there_is_not_found(get: Get, path: str, message: str) -> None:
+def test_unknown_datasets_episodes_and_files_are_not_found(get: Get, path: str, message: str) -> None:
     assert failure(get(path), 404) == message
 
 

@@ -50,7 +50,7 @@ def test_a_policy_is_paid_by_the_served_checkpoint(tmp_path: Path) -> None:
     assert all(0 < reward < 1 for reward in paid)
 
 
-def test_the_demo_s_checkpoint_tells_right_from_wrong_on_clips_it_never_saw() -> None:
+def test_the_demo_s_checkpoint_separates_right_from_wrong_on_unseen_clips() -> None:
     """A part of the model card's figures, with the scores that the server's are compared with elsewhere."""
     encoders = {
         f"{kind}_encoder": str(REPOSITORY / "rfm_encoder" / "1" / f"{kind}_encoder") for kind in ("image", "text")
@@ -102,7 +102,7 @@ def test_a_checkpoint_of_one_s_own_scores_a_video(tmp_path: Path, monkeypatch: p
     assert (tmp_path / "rewards.png").read_bytes().startswith(PNG)
 
 
-def test_a_repository_that_cannot_be_served_is_told(tmp_path: Path) -> None:
+def test_rfm_try_refuses_a_repository_whose_path_has_spaces(tmp_path: Path) -> None:
     clip.write(tmp_path / "clip.mp4")
     spaced = tmp_path / "my models"
     spaced.symlink_to(REPOSITORY)

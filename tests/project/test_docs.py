@@ -294,9 +294,7 @@ def test_make_help_has_a_line_for_every_target() -> None:
 
 
 @pytest.mark.parametrize("minor", [9, 13])
-def test_a_python_that_the_packages_do_not_take_is_told_before_anything_is_installed(
-    tmp_path: Path, minor: int
-) -> None:
+def test_make_refuses_an_unsupported_python_before_anything_is_installed(tmp_path: Path, minor: int) -> None:
     stand_in, environment = tmp_path / "python", tmp_path / "venv"
     pretend = f"import sys; sys.version_info = (3, {minor}, 0); exec(sys.argv[1])"
     stand_in.write_text(f"#!/bin/sh\nexec {sys.executable} -c '{pretend}' \"$2\"\n")

@@ -56,7 +56,7 @@ def test_help_is_whole_says_defaults_as_one_writes_them_and_has_an_example_that_
     assert all(context.params[each.name] is not None for each in COMMANDS[name].params if each.required and each.name)
 
 
-def test_a_command_of_the_other_program_is_told_with_that_program() -> None:
+def test_a_command_of_the_other_program_is_refused_with_that_program_s_name() -> None:
     for program, other in (("rfm", "rfm-client"), ("rfm-client", "rfm")):
         names = {each.split()[1]: each for each in COMMANDS if each.startswith(f"{other} ")}
         missing = [name for name in names if f"{program} {name}" not in COMMANDS]

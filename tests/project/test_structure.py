@@ -207,7 +207,7 @@ LOADS = {  # modules: packages that must not be loaded with them
 
 @pytest.mark.slow
 @pytest.mark.parametrize("modules", LOADS)
-def test_a_module_starts_without_what_it_may_not_need(modules: str) -> None:
+def test_importing_a_module_loads_no_package_that_it_may_not_need(modules: str) -> None:
     code = f"import sys, {modules}; print(sorted({LOADS[modules]} & set(sys.modules)))"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
 

@@ -228,7 +228,7 @@ def test_late_scores_add_up_at_the_end(judge: Recorder, kind: type[Door]) -> Non
 
 
 @at_each_door
-def test_after_an_error_delta_pays_what_was_missed(judge: Recorder, kind: type[Door]) -> None:
+def test_after_an_error_delta_pays_the_missed_progress(judge: Recorder, kind: type[Door]) -> None:
     with opened(kind, judge, [CodedEnv(TERMINATES, (LAST,))], options(mode="delta")) as door:
         door.reset()
         judge.server.failing = 1
@@ -458,7 +458,7 @@ def test_an_environment_that_returns_the_next_observation_in_its_last_step_is_re
 
 
 @pytest.mark.parametrize("kind", [kind for kind in DOORS.values() if issubclass(kind, Vector)])
-def test_a_vector_tells_its_autoreset_mode(recorder: Recorder, kind: type[Vector]) -> None:
+def test_a_vector_exposes_its_autoreset_mode(recorder: Recorder, kind: type[Vector]) -> None:
     """TorchRL reads it."""
     assert kind(makers_of([CodedEnv()]), recorder, options()).env.autoreset_mode is kind.mode
 
@@ -636,7 +636,7 @@ REFUSED_AT = [
 
 
 @pytest.mark.parametrize(("kind", "asked", "message"), REFUSED_AT)
-def test_a_door_refuses_what_it_cannot_pay(
+def test_a_door_refuses_options_that_it_cannot_honour(
     recorder: Recorder, kind: type[Door], asked: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):

@@ -31,7 +31,7 @@ def options(**more: Any) -> RewardOptions:
     return RewardOptions(sampling="all", **{"frames_from": "pixels", **more})
 
 
-def test_a_reset_of_a_vector_takes_back_what_is_open_about_what_it_resets(late: LateClient) -> None:
+def test_a_reset_of_a_vector_cancels_open_requests_of_the_environments_it_resets(late: LateClient) -> None:
     tasks, options = [TASK, "let the pole fall"], RewardOptions(sampling="all", blocking=False)
     env = RewardModelVectorWrapper(SyncVectorEnv([cart_pole] * 2, autoreset_mode=DISABLED), late, tasks, options)
     env.reset(seed=0)

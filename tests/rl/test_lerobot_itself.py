@@ -26,7 +26,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_example_of_the_guide_prints_what_the_guide_shows(demo_server: Endpoints, folder: Path) -> None:
+def test_the_example_of_the_guide_prints_the_output_in_the_guide(demo_server: Endpoints, folder: Path) -> None:
     (code,) = re.findall(r"^```py\n(.*?)^```", GUIDE, re.MULTILINE | re.DOTALL)
     (shown,) = re.findall(r"^```text\n(.*?)^```", GUIDE, re.MULTILINE | re.DOTALL)
     assert run(["-c", code.replace("grpc://localhost:8001", demo_server.grpc_url)], folder) == shown

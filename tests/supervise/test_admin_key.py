@@ -62,7 +62,7 @@ def test_the_server_changes_nothing_without_its_key(served: Served, tmp_path: Pa
         pytest.param("", 0, -1, "expected a file, got FILE, which is none", id="folder"),
     ],
 )
-def test_a_key_file_that_cannot_be_used_is_told(
+def test_an_unusable_key_file_is_refused_without_showing_the_key(
     tmp_path: Path, content: str | None, user: int, mode: int, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "key"
@@ -120,13 +120,15 @@ def test_a_key_is_taken_out_of_the_environment() -> None:
         ("--trace-config", "--option=value"),
     ],
 )
-def test_options_that_rfm_serve_sets_and_what_is_no_option_are_refused(argument: str, expected: str) -> None:
+def test_options_that_rfm_serve_sets_and_arguments_that_are_no_options_are_refused(
+    argument: str, expected: str
+) -> None:
     server = TritonServer(REPOSITORY, Endpoints.free(), find_installation(), more_arguments=[argument])
     with pytest.raises(ServerStartError, match=f"tritonserver: expected {expected}, got {argument.split('=')[0]}$"):
         server.start_ready()
 
 
-def test_a_triton_that_can_limit_requests_is_told_to(tmp_path: Path) -> None:
+def test_the_limit_of_request_sizes_is_set_if_triton_has_the_option(tmp_path: Path) -> None:
     knows = tmp_path / "tritonserver"
     knows.write_bytes(b"\x00OPTION\x00http-max-input-size\x00")
     assert size_limits(Installation(knows), []) == [f"--http-max-input-size={MAX_HTTP_BYTES}"]

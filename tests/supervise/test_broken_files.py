@@ -83,7 +83,7 @@ def test_a_model_with_broken_files_is_refused_before_a_running_server_loads_it(t
     assert done.stderr.startswith(f"rfm: {repository}/rfm/1/model.py: expected the model's program, got none; ")
 
 
-def test_a_model_of_another_program_needs_only_what_triton_needs(tmp_path: Path) -> None:
+def test_a_model_of_another_program_needs_only_the_files_that_triton_needs(tmp_path: Path) -> None:
     folder = tmp_path / "foreign"
     (folder / "3").mkdir(parents=True)
     write_config(FOREIGN)(folder)

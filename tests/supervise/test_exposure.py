@@ -25,7 +25,9 @@ from secured import Papers
 from servers import wait_for
 
 
-def test_rfm_serve_says_what_others_may_not_reach(caplog: pytest.LogCaptureFixture) -> None:
+def test_rfm_serve_refuses_an_exposed_host_with_a_vulnerable_triton_unless_accepted(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     done = rfm("serve", "--repository", REPOSITORY, "--host", "0.0.0.0")
     told = "rfm: --host: expected a loopback address for Triton 2.51.0, which has known remote vulnerabilities"
     assert (done.exit_code, done.stderr[: len(told)]) == (1, told)

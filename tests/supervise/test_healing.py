@@ -40,7 +40,7 @@ HANG_S = 2
 AT_ONCE_S = 10.0  # a model process used to stay for two minutes
 
 
-def test_what_dies_or_hangs_is_healed_and_no_call_is_lost(tmp_path: Path) -> None:
+def test_a_model_process_that_dies_or_hangs_is_restarted_and_no_call_is_lost(tmp_path: Path) -> None:
     """tests/supervise/test_supervisor.py has the other faults."""
     trigger = tmp_path / "trigger"
     once = f"os.path.exists({str(trigger)!r}) and os.unlink({str(trigger)!r}) is None"

@@ -108,7 +108,9 @@ def test_a_model_whose_progress_may_be_missing_is_rolled_out(running: Running, f
     ],
     ids=["name", "version", "none before"],
 )
-def test_what_is_not_there_is_told_and_nothing_changes(running: Running, words: tuple[str, ...], message: str) -> None:
+def test_an_unknown_name_or_version_is_refused_and_nothing_changes(
+    running: Running, words: tuple[str, ...], message: str
+) -> None:
     before = running.models("list")
     assert message in running.refused(*words)
     assert running.models("list") == before
@@ -213,7 +215,7 @@ def test_each_model_is_probed_once_more_when_its_old_version_is_gone(
 
 @pytest.mark.parametrize("loads", [0, 2, 4])
 @pytest.mark.parametrize("returns", [True, False], ids=["and comes back", "for good"])
-def test_a_server_that_goes_away_leaves_what_a_restart_serves(
+def test_a_server_lost_during_a_rollout_leaves_the_earlier_versions_for_a_restart(
     three_models: Path, monkeypatch: pytest.MonkeyPatch, loads: int, returns: bool
 ) -> None:
     """``rfm_frames`` was not served."""

@@ -268,7 +268,7 @@ def test_triton_may_have_as_many_files_and_connections_open_as_its_user(tmp_path
     ids=["missing", "no program", "fails at once", "ends without serving"],
 )
 @pytest.mark.slow
-def test_a_program_that_does_not_serve_is_told_and_is_no_crash_loop(
+def test_a_tritonserver_that_cannot_serve_ends_rfm_serve_with_the_reason_and_no_crash_loop(
     tmp_path: Path, program: str | None, told: str
 ) -> None:
     file = tmp_path / "tritonserver"
@@ -299,7 +299,7 @@ def test_an_explicit_program_wins_over_path_and_path_over_the_wheel(
     assert find_installation(explicit).executable == explicit
 
 
-def test_no_triton_at_all_is_told_with_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_triton_the_error_names_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
     with pytest.raises(ServerStartError, match=r'pip install ".\[triton\]"'):
         find_installation()

@@ -209,7 +209,7 @@ def test_a_fault_of_a_load_counts_for_the_model_that_loads_and_is_part_of_no_cra
 
 
 @pytest.mark.slow
-def test_what_was_served_is_served_again_and_not_what_was_exported_since(tmp_path: Path) -> None:
+def test_a_restart_serves_the_same_models_and_versions_and_no_newer_export(tmp_path: Path) -> None:
     """Also what was loaded, and not what was unloaded."""
     with supervised(tmp_path, "a", "b") as stage:
         stand_in_triton.repository(tmp_path, "c")
@@ -284,7 +284,7 @@ def told(about: Status) -> dict[str, Any]:
     return {name: float(value) for name, value in (line.rsplit(" ", 1) for line in lines) if "ready" in name}
 
 
-def test_the_status_tells_nothing_of_what_there_was() -> None:
+def test_the_status_drops_models_and_reasons_that_no_longer_apply() -> None:
     about = Status()
     about.record({"a": NO_REASON, "b": NO_REASON, "a_frames": NO_REASON})
     about.record({"a": NO_REASON, "a_frames": NO_REASON})

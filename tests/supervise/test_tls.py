@@ -102,7 +102,7 @@ def mutual(running: Serving, papers: Papers) -> Endpoints:
 
 
 @pytest.mark.parametrize("scheme", ["grpc", "http"])
-def test_a_client_without_tls_is_told(secure: Endpoints, scheme: str) -> None:
+def test_the_error_of_a_client_without_tls_names_the_url_with_tls(secure: Endpoints, scheme: str) -> None:
     url = secure.grpc_url.replace("grpcs", scheme)
     with RewardClient(url, retry=False) as asked, pytest.raises(ServerUnavailableError) as caught:
         asked.progress(TRAJECTORY)
@@ -259,7 +259,7 @@ def test_a_closed_client_leaves_no_connection_to_a_server_that_hangs(papers: Pap
                 pass
 
 
-def test_what_cannot_be_used_is_refused(papers: Papers) -> None:
+def test_unusable_credentials_are_refused(papers: Papers) -> None:
     """No description has a key."""
     assert KEY not in repr(Credentials(api_key=KEY, headers={"x-api-key": KEY}))
     for url, options, message in (

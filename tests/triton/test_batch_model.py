@@ -193,7 +193,7 @@ def test_warm_ups_and_probes_are_not_counted(tmp_path: Path) -> None:
     assert model.samples == {("progress", "scored"): 3}
 
 
-def test_what_an_execution_took_is_told(tmp_path: Path) -> None:
+def test_metrics_report_the_costs_of_an_execution(tmp_path: Path) -> None:
     class Working(Model):
         def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
             execution.collate_s, execution.forward_s = 0.25, 0.5
@@ -233,7 +233,7 @@ def test_a_model_without_its_metrics_serves_all_the_same_and_says_so_once(
     assert LOGGED[-1].endswith(": ValueError: of another kind")
 
 
-def test_metrics_know_the_checkpoint_and_what_can_be_asked(tmp_path: Path) -> None:
+def test_metrics_have_the_checkpoint_and_each_sample_type(tmp_path: Path) -> None:
     Model(tmp_path, description=Description(source="org/name", network={"class": "Rewind"}))
     (told,) = (metric for metric in METRICS if metric.name == "rfm_checkpoint_info")
     assert told.value == 1
@@ -340,7 +340,7 @@ def _own_number_of_threads() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("_own_number_of_threads")
-def test_what_is_loaded_is_computed_in_a_thread_that_ends() -> None:
+def test_a_placement_runs_functions_in_a_thread_that_ends() -> None:
     seen: list[tuple[threading.Thread, int]] = []
     use_threads(2)
     placement = Placement(torch.device("cpu"), num_threads=3)

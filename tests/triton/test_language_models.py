@@ -159,7 +159,7 @@ def body(samples: list[ProgressSample], **more: bool) -> dict[str, Any]:
     return {"samples": [{"sample_type": "progress", "trajectory": each} for each in told], **more}
 
 
-def test_what_a_model_does_not_predict_is_none_or_an_error(asked: Served) -> None:
+def test_a_score_that_a_model_does_not_predict_is_none_or_an_error(asked: Served) -> None:
     with asked.client("top") as client:
         assert client.progress(samples_of("top")[0].trajectory).log_prob is None
     with asked.client("forward") as client:
@@ -186,7 +186,7 @@ def test_an_answer_without_a_score_fails_alone_and_unclear_answers_are_marked(as
     assert [each.unclear.tolist() for each in results] == [[True] * 2, [False] * 4]  # type: ignore[union-attr]
 
 
-def test_the_description_tells_what_is_given(asked: Served) -> None:
+def test_the_description_lists_the_scores_and_needs_of_each_model(asked: Served) -> None:
     infos = {}
     for name in MODELS:
         with asked.client(name) as client:
@@ -211,7 +211,7 @@ def test_the_description_tells_what_is_given(asked: Served) -> None:
     assert infos["top"].lacks == ("preference", "similarity", "success")
 
 
-def test_what_has_no_meaning_is_refused_by_name(asked: Served) -> None:
+def test_samples_and_options_without_meaning_for_a_model_are_refused_by_name(asked: Served) -> None:
     frames = np.zeros((3, 64, 96, 3), np.uint8)
     trajectory = Trajectory(frames=frames, task=TASK)
     with asked.client("top") as client:

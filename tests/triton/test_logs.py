@@ -113,7 +113,9 @@ BREAKING = ProgressSample(random_trajectory(0, 3), frame_steps=FAILING_STEPS)
 
 
 @pytest.mark.triton
-def test_what_is_refused_is_told_with_its_request_and_logged_at_debug(running: Running, protocol: str) -> None:
+def test_the_error_of_a_refused_sample_names_its_request_and_is_logged_at_debug(
+    running: Running, protocol: str
+) -> None:
     with running.client(protocol) as client, pytest.raises(InvalidSampleError, match="at most 16") as raised:
         client.evaluate([TOO_LONG])
     request_id = str(raised.value.request_id)
@@ -125,7 +127,7 @@ def test_what_is_refused_is_told_with_its_request_and_logged_at_debug(running: R
 
 
 @pytest.mark.triton
-def test_what_failed_is_logged_as_an_error_with_its_traceback(running: Running) -> None:
+def test_a_failed_sample_is_logged_as_an_error_with_its_traceback(running: Running) -> None:
     name = "a.fault/of-the-model"
     with running.client() as client, pytest.raises(InferenceFailedError) as raised:
         client.evaluate([BREAKING], request_id=name)

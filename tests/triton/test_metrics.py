@@ -94,7 +94,7 @@ def client(served: Served, model: str) -> RewardClient:
 
 
 @pytest.mark.slow
-def test_samples_are_counted_by_type_and_by_what_became_of_them_in_each_of_two_instances(served_too: Served) -> None:
+def test_samples_are_counted_by_type_and_outcome_in_each_of_two_instances(served_too: Served) -> None:
     """Failures are counted, too: in a batch, then alone, as the client asks again."""
     samples = mixed_samples(60)
     before = scrape(served_too)

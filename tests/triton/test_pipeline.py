@@ -79,7 +79,7 @@ def test_a_lone_request_on_an_idle_model_is_answered_by_execute(tmp_path: Path) 
     assert model.prepared == []  # other requests are prepared in turn
 
 
-def test_what_comes_while_a_batch_is_scored_is_prepared_and_makes_up_the_next(tmp_path: Path) -> None:
+def test_requests_that_come_while_a_batch_is_scored_are_prepared_and_form_the_next(tmp_path: Path) -> None:
     model = Ahead(tmp_path)
     first = model.begin()
     later = [request(count) for count in (5, 6, 7)]
@@ -92,7 +92,7 @@ def test_what_comes_while_a_batch_is_scored_is_prepared_and_makes_up_the_next(tm
     assert model.samples == {("progress", "scored"): 5}
 
 
-def test_what_is_not_prepared_waits_for_another_batch(tmp_path: Path) -> None:
+def test_requests_that_are_not_prepared_wait_for_another_batch(tmp_path: Path) -> None:
     model = Ahead(tmp_path)
     first = model.begin()
     model.may_prepare.clear()

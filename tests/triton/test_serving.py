@@ -159,7 +159,7 @@ BAD_FRAMES: dict[str, tuple[Tensors, str]] = {
 
 
 @pytest.mark.parametrize("name", [*BAD_EMBEDDINGS, *BAD_FRAMES])
-def test_what_cannot_be_scored_is_refused_with_what_was_expected(served: Served, name: str) -> None:
+def test_invalid_inputs_are_refused_with_the_expected_values(served: Served, name: str) -> None:
     is_video = name in BAD_FRAMES
     changes, message = BAD_FRAMES[name] if is_video else BAD_EMBEDDINGS[name]
     model, question = (f"{FRAMES_MODEL}_frames", QUESTION) if is_video else (MODEL, embedded())

@@ -118,7 +118,7 @@ def test_triton_says_so_in_these_words(asker: Asker, name: str) -> None:
 
 @pytest.mark.nightly
 @pytest.mark.slow
-def test_a_dead_process_and_an_unloaded_model_are_told_apart(served: Served) -> None:
+def test_a_dead_process_and_an_unloaded_model_give_different_errors(served: Served) -> None:
     config, model = goldens.config(MODEL), "mortal"
     rfm_export.export(config.checkpoint, served.repository, serve_config(config, model))
     askers = [Asker(served, protocol) for protocol in ("grpc", "http")]
