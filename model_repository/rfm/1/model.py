@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Triton's model of a scorer: samples of the wire contract in, their scores out."""
+"""Triton's model for a scorer: samples in the wire contract go in, scores come out."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Triton's model of the encoders: frames and task in, embeddings for the scorer out."""
+"""Triton's model for the encoders: frames and task go in, embeddings for the scorer come out."""
 
 from __future__ import annotations
 
