@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import uuid
 from collections.abc import Callable, Iterator
 
@@ -25,6 +26,7 @@ pytest_plugins = ("debian", "gateway_fixtures")
 SHARED = ("served", "triton")  # fixtures that start a server for the tests of many files
 LONGEST = {"supervise", "triton"}  # folders whose tests wait longest: the others run meanwhile
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what runs in its background
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"  # of processes that tests start, since other tests need the cores
 os.environ[RUN] = uuid.uuid4().hex  # marks the processes of this run
