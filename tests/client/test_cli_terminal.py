@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 import importlib.metadata
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -43,7 +44,8 @@ def videos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 def shown(url: str, *asked: object, code: ExitCode = ExitCode.OK) -> tuple[set[str], str]:
     """Run a command about the demo's checkpoint. Return words and lines, which fit the terminal."""
-    result = invoke(*asked, "--url", url, env={"COLUMNS": f"{WIDTH}"})
+    path = f"{RFM_CLIENT.parent}:{os.environ['PATH']}"  # or commands would begin with the program's folder
+    result = invoke(*asked, "--url", url, env={"COLUMNS": f"{WIDTH}", "PATH": path})
     assert result.exit_code == code, result.output
     assert max(map(len, result.stdout.splitlines())) <= WIDTH
     return {*result.stdout.split()}, result.stdout

@@ -38,6 +38,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
+from tolerances import TOLERANCE
 from vlm import BFLOAT16, PLAIN, assert_close, load, predictor_of, upstream_inputs, video
 
 PIXEL_TOLERANCE = 1e-6  # relative, of a sum over all pixels
@@ -201,18 +202,20 @@ def test_a_pair_of_two_frame_sizes_is_scored_as_transformers_reads_it(
     (outcome,) = Engine(predictor).evaluate([sample])
     assert isinstance(outcome, PreferenceResult)
     assert row.query is not None
+    # Newer kernels sum in another order. In float32 this network itself is up to 1.13e-6 from its float64 form.
+    atol = 1e-6 if TRANSFORMERS < 5 else TOLERANCE
     with torch.inference_mode():
         hidden = network.model(**inputs, use_cache=False).last_hidden_state[0]
         assert outcome.preference == pytest.approx(
-            network.preference_head(hidden[row.query]).sigmoid().item(), abs=1e-6
+            network.preference_head(hidden[row.query]).sigmoid().item(), abs=atol
         )
         for scores, spans in zip((outcome.first, outcome.second), row.spans, strict=True):
             states = torch.stack([pooled(network, hidden[start:stop]) for start, stop in spans])
             places = np.arange(len(scores.progress)) // (1 if network.config.multi_image else 2)
             progress = progress_from_logits(network.progress_head(states))[places]
-            np.testing.assert_allclose(scores.progress, progress, rtol=0, atol=1e-6)
+            np.testing.assert_allclose(scores.progress, progress, rtol=0, atol=atol)
             success = network.success_head(states).squeeze(-1).sigmoid()[places]
-            np.testing.assert_allclose(scores.success, success, rtol=0, atol=1e-6)
+            np.testing.assert_allclose(scores.success, success, rtol=0, atol=atol)
 
 
 def test_the_task_is_not_a_template() -> None:
