@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
@@ -30,12 +31,14 @@ from rfm_client.contract.samples import (
     SimilaritySample,
     Trajectory,
     blank_trajectory,
+    with_pictures,
 )
 from rfm_client.contract.wire import DEFAULT_MODEL, PROBE_PREFIX, Part, encoder_name, frames_name
 from rfm_client.episodes.episodes import AsyncEpisode, AsyncEpisodes
 from rfm_client.episodes.options import EpisodeOptions, StepKeywords, StepScore
 from rfm_client.episodes.scorer import Asked, StepScorer
 from rfm_client.episodes.steps import Steps
+from rfm_client.frames.fit_to_checkpoint import resize_frames
 from rfm_client.frames.sampling import Sampling
 from rfm_client.scoring.samples import Call, CallOptions, SampleScorer, results_of
 from rfm_client.transport.calls import Transport, connect
@@ -162,9 +165,12 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         info = await self.model_info(frames=trajectory.frames is not None, timeout_s=options.get("timeout_s"))
         info.check_scores_prefixes()
         rule = sampling or Sampling.of(None, None, info.max_frames, trained_padding=info.trained_padding)
-        samples, results = rule.samples(trajectory), list[Result]()
         if trajectory.frames is not None:
             self._scorer.tell_of_blank(trajectory.frames)
+        if options.pop("resize", False) and info.frame_size is not None:  # once, because prefixes share frames
+            shrink = partial(resize_frames, size=info.frame_size)
+            trajectory = await asyncio.to_thread(with_pictures, trajectory, shrink)
+        samples, results = rule.samples(trajectory), list[Result]()
         # in a thread, because copying many frames would block the event loop
         while part := await asyncio.to_thread(lambda: list(itertools.islice(samples, PREFIXES_AT_A_TIME))):
             call = self._call(options)

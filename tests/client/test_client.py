@@ -129,6 +129,7 @@ def test_each_trajectory_is_resized_by_its_own_size_when_asked(engines: EngineSe
         smaller = [replace(t, frames=resize_frames(t.positions, size)) for t in (wide, tall)]
         assert smaller[0].positions.shape[1:] != smaller[1].positions.shape[1:]
         assert_same(client.preference(wide, tall, resize=True), client.preference(*smaller))
+        assert_same(client.curve(wide, resize=True), client.curve(smaller[0]))
         resized = client.progress(wide, resize=True)
         np.testing.assert_allclose(resized.progress, client.progress(wide).progress, rtol=0, atol=5e-4)
 

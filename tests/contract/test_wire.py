@@ -268,3 +268,11 @@ def test_arrays_whose_length_varies_are_ragged_and_second_frames_optional() -> N
     assert {spec.name for spec in inputs if spec.ragged} == {"video_embeddings", "frames", "second_frames"}
     assert {spec.name for spec in inputs if spec.optional} == {"second_frames"}
     assert not any(spec.ragged for spec in (*wire.encoder_outputs(5, 3), *wire.score_outputs(4)))
+
+
+def test_a_request_asks_for_every_given_score_except_those_on_request() -> None:
+    sample = ProgressSample(embedded(0, 2))
+    always, given = {"progress", "success"}, {"unclear", "remaining_s", "relative_s", "entropy", "hop"}
+    assert {*wire.outputs_for([sample])} == always
+    assert {*wire.outputs_for([sample], FRAME_SCORES)} == always | given
+    assert {*wire.outputs_for([sample], FRAME_SCORES, all_scores=True)} == always | given | {"log_prob"}

@@ -235,6 +235,10 @@ WRONG = {
     "copies": (lambda c: c.update(value_token_repeat=8), "value_token_repeat: expected 8, as in config.json, got 3"),
     "token": (lambda c: c.update(value_token_id=7), "value_token_id: expected 665, the tokenizer's id of <value>"),
     "head": (lambda c: c["value_head_config"].update(head_type="mlp"), "head_type: expected bro or linear"),
+    "width": (
+        lambda c: c["value_head_config"].update(hidden_dims=0),
+        "hidden_dims: expected a whole number of at least",
+    ),
     "bins": (lambda c: c["value_tokenizer_config"].update(support_transform="log"), "support_transform: expected one"),
     "edges": (lambda c: c["value_tokenizer_config"].update(support_transform="quantile"), "33 ascending numbers"),
     "heads": (lambda c: c.update(num_value_heads=3), "value_heads.2.proj"),

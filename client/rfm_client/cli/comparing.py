@@ -78,7 +78,7 @@ class Comparison:
     def tables(self) -> list[str]:
         """Return a table of sources, best first, a table of pairs, and without a ranking a legend."""
         columns = ("video", "rank", "P(wins)", "final progress", "final success", "frames")
-        pairs = ("first", "second", "P(first wins)", "asked second first", "mean", "orders")
+        pairs = ("first", "second", "P(first wins)", "order swapped", "mean", "orders")
         return [
             table("", columns, [self._row(index) for index in self._shown]),
             table("", pairs, [self._pair_row(*couple) for couple in self.couples()], names=2),
