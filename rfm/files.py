@@ -70,7 +70,7 @@ class CheckpointError(LocatedError):
 
 
 def misfits(*others: type[Exception]) -> tuple[type[Exception], ...]:
-    """Return ``others`` and the exceptions that libraries raise for unexpected content (Hub: from transformers 5)."""
+    """Return ``others`` and the exceptions that libraries raise for unexpected content."""
     from huggingface_hub import errors
 
     return (*others, *_MISFITS, getattr(errors, "StrictDataclassError", ValueError))

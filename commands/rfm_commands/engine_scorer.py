@@ -36,10 +36,11 @@ class EngineScorer:
     """
 
     def __init__(self, source: str, *, device: str = "cpu", dtype: torch.dtype | None = None, **options: Any) -> None:
-        """Load a checkpoint folder or Hugging Face id. Raises CheckpointError, or ExportError for a missing device.
+        """Load a checkpoint folder or Hugging Face id.
 
         dtype: the network's type; None: float32 on the CPU, else the checkpoint's own
         options: as in ``rfm.published.read``
+        Raises ExportError for a missing device, and errors as ``read``.
         """
         on = device_named(device)
         loaded = published.read(source, **options)

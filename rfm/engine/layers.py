@@ -184,7 +184,7 @@ def _call_each_once() -> None:
 
 @dataclass(frozen=True)
 class Normalisation:
-    """Normalise pixels per channel: (value - 255 mean) / (255 std)."""
+    """Normalise pixels per channel, on the network's device: (value - 255 mean) / (255 std)."""
 
     mean: tuple[float, ...]
     std: tuple[float, ...]

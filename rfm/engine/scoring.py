@@ -305,7 +305,7 @@ def _finite(outcomes: Sequence[Result | RewardError], *, lacks: Collection[str])
     lacks: scores the network does not predict, which are NaN
 
     Frames that the model does not answer about are not checked. Neither are progress logits: RoboReward has none for an
-    answer without a digit, and progress shows other models' faults.
+    answer without a digit, and in the other models a fault also shows in progress.
     """
     scores = [[] if isinstance(each, RewardError) else list(_scores(each, lacks)) for each in outcomes]
     of_all = [array for of_one in scores for array in of_one]

@@ -23,6 +23,7 @@ from rfm.published.provenance import assumption_lines
 from rfm.published.reader import Loaded, Reader, asked, check_used
 from rfm.published.run_config import HEADS, SIMILARITY, constant_heads, training_notes
 from rfm.weights import check_values
+from rfm_client.contract.checks import require
 
 
 def reader_of(family: Family) -> Reader:
@@ -52,17 +53,19 @@ def choose(folder: Path, package: str | None = None, options: CheckpointConfig |
 
 
 def read(source: str | Path, *, family: str | None = None, **options: Any) -> Loaded:
-    """Read a checkpoint from a local folder or Hugging Face id. Raises CheckpointError.
+    """Read a checkpoint from a local folder or Hugging Face id.
 
     family: the family's package; None: the family that reads the folder's files
-    options: fields of ``CheckpointConfig``
+    options: fields of ``CheckpointConfig``, except ``dtype``, which ``Engine.of`` takes
+    Raises CheckpointError; ConfigError for an option's wrong value, TypeError for an unknown option.
     """
-    folder, settings = find(source), CheckpointConfig(**options)
+    folder, settings = find(source), CheckpointConfig(checkpoint=str(source), **options)
+    require("dtype", settings.dtype is None, "none, since Engine.of takes it", settings.dtype)
     return read_from(folder, choose(folder, family, settings), settings)
 
 
 def load(source: str | Path, **options: Any) -> Checkpoint:
-    """Load a checkpoint from a local folder or Hugging Face id. options: as for ``read``. Raises CheckpointError."""
+    """Load a checkpoint from a local folder or Hugging Face id. options and errors: as for ``read``."""
     return read(source, **options).checkpoint
 
 

@@ -45,7 +45,7 @@ def asked(options: CheckpointConfig) -> tuple[str | None, dict[str, str]]:
 
 
 def settings_asked(options: CheckpointConfig, known: Mapping[str, type]) -> dict[str, Any]:
-    """Return the user's reward model settings as numbers or booleans. Raises CheckpointError if one is wrong.
+    """Return the user's reward model settings, converted to their types. Raises CheckpointError if one is wrong.
 
     known: types by setting
     """

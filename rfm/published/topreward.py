@@ -27,7 +27,7 @@ from rfm_client.contract.checks import require
 
 LEROBOT, ROBOMETER = "topreward", "topreward-robometer"  # values for ``--as``
 REWARD_MODELS = (LEROBOT, ROBOMETER)
-_TYPE = "topreward"  # the key ``type`` in LeRobot's config.json
+_TYPE = "topreward"  # value of the key ``type`` in LeRobot's config.json
 FPS = 2.0  # LeRobot's default
 MAX_FRAMES, NUM_PREFIXES = 64, 15  # in Robometer's baseline
 MOST_FRAMES = 512  # default limit in LeRobot's variant: each prefix costs a question

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-_PICKLE_STEM = "pytorch_model"  # transformers' name for pickled weights
+PICKLE_STEM = "pytorch_model"  # transformers' name for pickled weights
 _ENCODERS = ("image_encoder", "text_encoder")  # subfolders in an exported checkpoint
 _LEVELS = ("*", "*/*", "*/*/*")  # how deep checkpoints lie in a training run's folder or in a model repository
 _MAX_SUGGESTED = 5
@@ -76,7 +76,7 @@ def read_weights(folder: Path, model_type: str | None = None) -> dict[str, Tenso
     elif is_there(folder / WEIGHTS_INDEX):
         weights = _read_shards(folder / WEIGHTS_INDEX)
     else:
-        refuse_pickles(folder, WEIGHTS, _PICKLE_STEM)
+        refuse_pickles(folder, WEIGHTS, PICKLE_STEM)
         got = cut(", ".join(sorted(path.name for path in folder.iterdir()))) or "nothing"
         raise CheckpointError.at(folder, f"{WEIGHTS} or {WEIGHTS_INDEX}", f"{got}: {_below(folder)}")
     _check_network(folder, weights, model_type)
@@ -153,10 +153,7 @@ def _below(folder: Path) -> str:
     found = [file.parent for level in _LEVELS for name in names for file in sorted(folder.glob(f"{level}/{name}"))]
     checkpoints = [str(path) for path in dict.fromkeys(found) if path.name not in _ENCODERS]
     if not checkpoints:
-        return (
-            "a checkpoint's folder has it, beside config.json; pickled weights are not fetched: `hf download org/name "
-            "--local-dir FOLDER`, then name FOLDER, and the message says how to convert them"
-        )
+        return "a checkpoint's folder has it, beside config.json"
     return f"name the checkpoint in it: {cut(', '.join(checkpoints[:_MAX_SUGGESTED]))}"
 
 
@@ -171,16 +168,22 @@ def has_head(weights: Iterable[str], head: str) -> bool:
     return any(name.startswith(f"{head}_head.") for name in weights)
 
 
+def pickled_weights(names: Iterable[str], stem: str) -> list[str]:
+    """Return the pickles among a folder's file names that may hold weights.
+
+    stem: how transformers' names begin; if files with such names exist, only these are returned
+    """
+    pickles = sorted(name for name in names if _is_any(name, _PICKLES) and not _is_any(name, _STATES))
+    return [name for name in pickles if _is_any(name, (f"{stem}.bin", f"{stem}-*-of-*.bin"))] or pickles
+
+
 def refuse_pickles(folder: Path, wanted: str, stem: str) -> None:
     """Raise CheckpointError if ``folder`` has pickled weights instead of the missing file ``wanted``.
 
     Pickles are never opened, since that may run code. The message holds a command that converts them.
-    stem: of transformers' names; if files with such names exist, other pickles do not count
+    stem: as in ``pickled_weights``
     """
-
-    files = sorted(file.name for file in folder.iterdir())
-    pickles = [name for name in files if _is_any(name, _PICKLES) and not _is_any(name, _STATES)]
-    names = [name for name in pickles if _is_any(name, (f"{stem}.bin", f"{stem}-*-of-*.bin"))] or pickles
+    names = pickled_weights((file.name for file in folder.iterdir()), stem)
     if not names:
         return
     if len(names) > 1 and f"{stem}.bin" in names:

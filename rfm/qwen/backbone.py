@@ -350,9 +350,11 @@ class Part:
             merged, *self._deeper = features.unbind(1)
             self.states.flatten(0, 1).index_copy_(0, self._at, merged[self._picked].to(self.states.dtype))
         self._turned = language.rotary_emb(self.states, inputs["position_ids"])
-        known = inspect.signature(language.layers[0].forward).parameters
-        cache = "cache" if "cache" in known else "past_key_values"  # transformers 5.x renamed the argument
-        self._options = {} if key_values is None else {cache: key_values}
+        self._options = {}
+        if key_values is not None:
+            known = inspect.signature(language.layers[0].forward).parameters
+            cache = "cache" if "cache" in known else "past_key_values"  # transformers 5.x renamed the argument
+            self._options = {cache: key_values}
 
     def run(self, number: int, layer: Any) -> None:
         """Run layer ``number`` on the tokens."""

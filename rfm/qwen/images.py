@@ -114,7 +114,7 @@ class QwenImages:
 
     patch_px: P
     size_px: height and width in the training run's settings; None: keep the frame's own
-    max_video_side_px: scale larger video frames down to this side first; None: don't
+    max_video_side_px: scale larger video frames down to this side first; None: no scaling
     """
 
     patch_px: int

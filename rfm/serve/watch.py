@@ -30,7 +30,7 @@ from rfm.serve.triton_server import Config, TritonServer
 from rfm_client.contract.description import num_instances
 
 LOOK_S = 0.5
-LOOKS = 3  # a restart needs at least LOOKS failed probes
+LOOKS = 3  # in a row without an answer, before Triton counts as silent
 _TIMEOUT_S = 1.5
 _INDEX_TIMEOUT_S = 5.0
 _PROGRESS = re.compile(  # counters that grow while a model makes progress

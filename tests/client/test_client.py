@@ -162,7 +162,7 @@ def filmed(num_frames: int) -> Trajectory:
 
 
 class Described(Shelf):
-    """Says ``more`` of the model. lacks_description: says nothing"""
+    """Describes the model with ``more``. lacks_description: does not describe it"""
 
     lacks_description = False
     more: Mapping[str, Any] = MappingProxyType({})

@@ -16,7 +16,7 @@ from PIL import Image
 
 from pictures import TOP, WRIST
 from rfm_client import InvalidSampleError, Trajectory, UInt8Array, as_trajectory, load_trajectory
-from rfm_client.frames import Correction, FrameFileError, Orientation, Video
+from rfm_client.frames import Correction, FrameFileError, Orientation, Video, frame_times_s
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (4, 6, 8, 3), np.uint8)
 SHAPED = "uint8 or float in 0..1 [T, H, W, 3] or [T, 3, H, W]"
@@ -243,7 +243,7 @@ def write_in_a_row(file: Path, kind: str, **options: Any) -> None:
             picture.save(opened, kind, **options)
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".tif"])
+@pytest.mark.parametrize("suffix", [".jpg", ".tif", ".png", ".webp"])
 def test_exif_data_turn_pictures(tmp_path: Path, suffix: str) -> None:
     """Also opened ones, and those with EXIF data but without a turn."""
     stored = np.repeat(np.repeat(FRAMES[0], 8, axis=0), 8, axis=1)
@@ -253,6 +253,7 @@ def test_exif_data_turn_pictures(tmp_path: Path, suffix: str) -> None:
             (frame,) = load_trajectory(tmp_path / f"a{suffix}", fps=fps).positions
             assert frame.shape == upright.shape
             assert np.abs(frame.astype(int) - upright).mean() < 16  # JPEG halves the colours' resolution
+        assert frame_times_s(tmp_path / f"a{suffix}", 1) == [0.0]
         with Image.open(tmp_path / f"a{suffix}") as opened:
             np.testing.assert_array_equal(as_trajectory({TOP: [opened]}).positions, [frame])
 

@@ -139,7 +139,7 @@ def test_a_request_over_two_gib_is_refused_before_it_is_copied() -> None:
         client.encode(Trajectory(frames=frames, task="stack the cups"))
     assert refused.value.message == (
         "frames: expected at most 2.15 GB in a request, got 6.44 GB; shrink the frames (resize, --resize), score fewer "
-        "(subsample, --fps), or share memory with a server on this host (shared_memory)"
+        "(subsample, or --fps for videos), or share memory with a server on this host (shared_memory)"
     )
     check_size({"frames": frames}, {"frames"})  # which go through shared memory
 

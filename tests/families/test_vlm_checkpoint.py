@@ -189,7 +189,7 @@ VIDEO = "q25_video_avg_disc10"
 SIZES = {"do_resize": False, "size": {"longest_edge": 1, "shortest_edge": 1}, "resample": 0, "max_pixels": 5}
 OF_TIMES = {"do_sample_frames": True, "fps": 1, "num_frames": 3, "cap_pixels_per_frame": True, "max_video_tokens": 9}
 # Keys of a Qwen2VLImageProcessor beside those of the base model, as transformers 4.40 to 5.24 write them.
-FORMS = {
+IDLE_KEYS = {
     "_valid_processor_keys": ["images", "do_resize"], "auto_map": {"AutoProcessor": "own.Processor"}, "crop_size": None,
     "data_format": "channels_first", "default_to_square": False, "device": None, "disable_grouping": None,
     "do_center_crop": False, "do_convert_rgb": False, "image_seq_length": 5, "pad_size": None, "return_tensors": None,
@@ -198,7 +198,7 @@ FEW = ("size", "patch_size", "temporal_patch_size", "merge_size", "image_mean", 
 TAKEN: dict[str, tuple[str, Spoil]] = {
     "sizes, which Robometer's code decides": (PLAIN, settings(IMAGES, **SIZES)),
     "times of videos, which RFM's code decides": (VIDEO, settings(VIDEOS, **SIZES, **OF_TIMES)),
-    "keys without effect": (PLAIN, settings(IMAGES, **FORMS)),
+    "keys without effect": (PLAIN, settings(IMAGES, **IDLE_KEYS)),
     "an unknown setting that is off": (PLAIN, settings(IMAGES, sharpen=False, blur=None)),
     "few fields, as Qwen publishes": (PLAIN, in_json(IMAGES, lambda all: [all.pop(n) for n in [*all] if n not in FEW])),
     "the same in two files": (PLAIN, nested()),

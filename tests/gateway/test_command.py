@@ -17,7 +17,7 @@ import uvicorn
 from gateways import NO_TRITON, free_port, inside, running
 from in_process import rfm
 from rfm_client import ServerError
-from rfm_client.contract.process import MOST, LogLines
+from rfm_client.contract.process import MOST_FILES, LogLines
 from rfm_client.contract.triton import denied, not_served, unreachable
 from rfm_gateway import GatewayConfig, mounting
 from rfm_gateway.command import page_link
@@ -34,7 +34,7 @@ def test_a_gateway_opens_all_the_files_that_it_may_and_needs_the_key_of_its_vari
     try:
         with running(Endpoints.free(), tmp_path, RFM_GATEWAY_API_KEY=KEY) as gateway:
             soft, hard = resource.prlimit(gateway.process.pid, resource.RLIMIT_NOFILE)
-            assert soft == min(hard, MOST)
+            assert soft == min(hard, MOST_FILES)
             assert gateway.get("/metrics", headers={"X-API-Key": KEY}).ok
             assert gateway.get("/metrics").status_code == 401
             assert KEY not in gateway.log

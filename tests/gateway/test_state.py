@@ -84,13 +84,13 @@ def test_a_server_that_hangs_is_unhealthy_with_the_reason(triton: Triton, tiny: 
 
 
 def test_the_devices_are_busy_while_a_request_waits(triton: Triton, monkeypatch: pytest.MonkeyPatch) -> None:
-    read = ServerStatus.read
+    read = ServerStatus.read_async
 
-    def waiting(*arguments: Any, **options: Any) -> ServerStatus:
-        status = read(*arguments, **options)
+    async def waiting(*arguments: Any, **options: Any) -> ServerStatus:
+        status = await read(*arguments, **options)
         return replace(status, models=[replace(model, requests_pending=1) for model in status.models])
 
-    monkeypatch.setattr(ServerStatus, "read", waiting)
+    monkeypatch.setattr(ServerStatus, "read_async", waiting)
     ends = triton.endpoints
     with inside(triton=ends.grpc_url, model=TINY, metrics_url=ends.metrics_url) as gateway:
         status = gateway.get("/gpu_status").json()

@@ -357,7 +357,10 @@ NOTES: dict[str, tuple[Callable[[Any], object], list[str]]] = {
         ],
     ),
     "an observation after the last action": (put("data/demo_2/actions", np.zeros((NUM_FRAMES - 1, 7))), []),
-    "another number of samples": (told("data/demo_1", "num_samples", 7), []),
+    "another number of samples": (
+        told("data/demo_1", "num_samples", 7),
+        ["lengths: num_samples differs: demo_1 (7, has 5): each observation gets a label"],
+    ),
     "a camera whose frames lie in other files": (
         lambda opened: opened.create_virtual_dataset("data/demo_0/obs/wrist", h5py.VirtualLayout(FRAMES.shape, "u1")),
         ["left out: wrist: a virtual dataset: copy its frames into the file"],

@@ -49,9 +49,8 @@ def test_a_model_process_that_dies_or_hangs_is_restarted_and_no_call_is_lost(tmp
     with (
         administered(repository, hang_s=HANG_S) as served,
         served.client() as client,
-        Callers(
-            direct(client), exam, count=16, pause_s=0.05
-        ) as callers,  # without a pause, they would slow the restart
+        # without a pause, they would slow the restart
+        Callers(direct(client), exam, count=16, pause_s=0.05) as callers,
     ):
         for number, is_hung in enumerate((False, True), 1):
             if is_hung:

@@ -33,7 +33,7 @@ from rfm.serve.access import free_ports
 from rfm.serve.installation import ServerStartError, find_installation
 from rfm.serve.triton_server import Endpoints, TritonServer, short_spin
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
-from rfm_client.contract.process import MOST
+from rfm_client.contract.process import MOST_FILES
 from servers import PATIENCE_S, Serving, children, model_processes, wait_for
 
 VIDEO = ROOT / "tests/videos/jaco_play_pick_up_green_cup.mp4"
@@ -254,7 +254,7 @@ def test_triton_may_have_as_many_files_and_connections_open_as_its_user(tmp_path
     words = [*command(REPOSITORY, Endpoints.free()), f"--tritonserver={program}"]
     done = subprocess.run(["sh", "-c", 'ulimit -Sn 256; exec "$@"', "sh", *words], capture_output=True, text=True)
     soft, hard = done.stdout.split()
-    assert int(soft) == (MOST if hard == "unlimited" else min(int(hard), MOST))
+    assert int(soft) == (MOST_FILES if hard == "unlimited" else min(int(hard), MOST_FILES))
 
 
 @pytest.mark.parametrize(

@@ -159,7 +159,7 @@ def body(samples: list[ProgressSample], **more: bool) -> dict[str, Any]:
     return {"samples": [{"sample_type": "progress", "trajectory": each} for each in told], **more}
 
 
-def test_a_score_that_a_model_does_not_predict_is_none_or_an_error(asked: Served) -> None:
+def test_a_score_not_asked_for_is_none_and_deltas_over_unanswered_frames_are_an_error(asked: Served) -> None:
     with asked.client("top") as client:
         assert client.progress(samples_of("top")[0].trajectory).log_prob is None
     with asked.client("forward") as client:

@@ -107,7 +107,9 @@ def create_app(
     app.add_middleware(LingerMiddleware)  # outermost: responses are counted before it lingers
     guards = [] if api_key is None else [Depends(key_check(api_key))]
     guarded = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
-    evaluator = Evaluator(client, limits, parts, folder, config.use_frame_steps, config.refuse_blank)
+    evaluator = Evaluator(
+        client, limits, parts, folder, use_frame_steps=config.use_frame_steps, refuse_blank=config.refuse_blank
+    )
     place = Depends(Places(config, metrics).taken)
     _add_evaluations(guarded, limits, evaluator, metrics, place)
     _add_reports(guarded, state, metrics)

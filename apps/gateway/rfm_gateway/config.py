@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -134,8 +133,7 @@ class GatewayConfig(Settings):
 
     async def status(self, timeout_s: float) -> ServerStatus:
         """Read the state of Triton and the devices. Raises ServerError."""
-        return await asyncio.to_thread(
-            ServerStatus.read,
+        return await ServerStatus.read_async(  # in one event loop, since gRPC keeps each that it has met
             self.triton_url,
             metrics_url=self.metrics_url,
             timeout_s=timeout_s,

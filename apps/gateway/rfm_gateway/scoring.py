@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
 from traceback import clear_frames
@@ -67,6 +67,7 @@ class Evaluator:
     limits: BodyLimits
     parts: ServedParts
     folder: Path | None
+    _: KW_ONLY
     use_frame_steps: bool
     refuse_blank: bool
 

@@ -20,7 +20,7 @@ from rfm_labels.datasets.faults import DatasetError
 from rfm_labels.label_files import LabelFile
 from rfm_labels.metadata import PROGRESS, SCORES, Cost, blank_from_metadata, blank_lines
 from rfm_labels.options import DEFAULTS, QUIET, LabelOptions, Watch
-from rfm_labels.plan import Plan, plan_labels
+from rfm_labels.plan import Plan, checked_episodes, plan_labels
 from rfm_labels.scorer import Scorer
 from rfm_labels.scoring import FailedEpisode, Run
 from rfm_labels.summary import Summary, summary_of
@@ -90,6 +90,7 @@ def planned(dataset: Dataset, scorer: Scorer, outputs: Outputs, watch: Watch = Q
                 raise DatasetError(problem, error.where) from error
             labels = f"its labels of {len(file.digests)} episodes are" if file.digests else "it is"
             watch.note(f"--overwrite: {error}; {labels} replaced")
+    checked_episodes(dataset, options, watch)  # last, since it reads most
     return plan
 
 

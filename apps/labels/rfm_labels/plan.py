@@ -6,7 +6,8 @@ from __future__ import annotations
 import importlib.metadata
 import itertools
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -279,9 +280,12 @@ def _check_views(options: LabelOptions, cameras: Sequence[str], checkpoint: Chec
         raise InvalidSampleError.at("views", expected, ", ".join(cameras), remedy)
 
 
-def checked_episodes(dataset: Dataset, options: LabelOptions, watch: Watch = QUIET) -> list[DatasetEpisode]:
+def checked_episodes(
+    dataset: Dataset, options: LabelOptions, watch: Watch = QUIET, *, tables_only: bool = False
+) -> list[DatasetEpisode]:
     """Return the chosen episodes after checking tables and frames, without decoding. Other episodes are not read.
 
+    tables_only: True: do not check frames
     Raises FaultsError with all faults, including other shards' faults, because every shard needs the same episodes;
     DatasetError for an episode that the dataset lacks.
     """
@@ -289,15 +293,17 @@ def checked_episodes(dataset: Dataset, options: LabelOptions, watch: Watch = QUI
     cameras, views = chosen_cameras(dataset, options, everywhere)
     episodes: list[DatasetEpisode] = []
     faults: dict[int, RewardError] = {}
-    watch.checking(len(numbers))
+    if not tables_only:
+        watch.checking(len(numbers))
     for number in numbers:
         try:
             episode = dataset.episode(number)
             check_order([*episodes[-1:], episode])
-            for camera in dict.fromkeys((*cameras, *views)):
+            for camera in () if tables_only else dict.fromkeys((*cameras, *views)):
                 dataset.check(episode, camera)
             episodes.append(episode)
-            watch.checked(episode)
+            if not tables_only:
+                watch.checked(episode)
         except RewardError as fault:
             faults[number] = fault
     if faults and options.shard is not None:
@@ -307,6 +313,16 @@ def checked_episodes(dataset: Dataset, options: LabelOptions, watch: Watch = QUI
     if options.shard is None:  # episodes in another shard may need the task
         dataset.given_task.check_used(episodes)
     return episodes
+
+
+@contextmanager
+def all_faults(dataset: Dataset, options: LabelOptions) -> Iterator[None]:
+    """Replace an error from the block by all faults in tables and frames, if there are any."""
+    try:
+        yield
+    except RewardError:
+        checked_episodes(dataset, options)
+        raise
 
 
 def check_order(episodes: Sequence[DatasetEpisode]) -> None:
@@ -319,12 +335,13 @@ def check_order(episodes: Sequence[DatasetEpisode]) -> None:
 
 
 def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch = QUIET) -> Plan:
-    """Check the dataset, report decisions to ``watch``, and return the plan.
+    """Check everything except the frames, report decisions to ``watch``, and return the plan.
 
     Raises DatasetError, RewardError if the scorer does not answer, ValueError if the sampling rule needs a frame count.
     """
     recipe = Recipe.of(options, dataset, scorer.checkpoint())
-    episodes = checked_episodes(dataset, options, watch)
+    with all_faults(dataset, options):
+        episodes = checked_episodes(dataset, options, tables_only=True)
     recipe.check_lengths(episodes)
     several = sum(bool(episode.tasks) for episode in episodes)
     if several:
@@ -345,7 +362,8 @@ def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: 
     tasks = _task_lines(dataset, episodes)
     for line in (*recipe.explanation(options), *left_out, *dataset.notes, *turned, *swapped, *tasks):
         watch.note(line)
-    return make_plan(dataset, recipe, episodes)
+    with all_faults(dataset, options):
+        return make_plan(dataset, recipe, episodes)
 
 
 def _task_lines(dataset: Dataset, episodes: Sequence[DatasetEpisode]) -> list[str]:

@@ -55,8 +55,12 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
     try:
         for path in config.dataset:
             dataset = open_to_show(path)
-            kind = {LeRobotDataset: ShownLeRobot, Hdf5Dataset: ShownHdf5}.get(type(dataset), ShownDataset)
-            datasets.append(kind(dataset))
+            if isinstance(dataset, LeRobotDataset):
+                datasets.append(ShownLeRobot(dataset))
+            elif isinstance(dataset, Hdf5Dataset):
+                datasets.append(ShownHdf5(dataset))
+            else:  # RLDS
+                datasets.append(ShownDataset(dataset))
             datasets[-1].check()
     except (DatasetError, ImportError) as error:
         raise ConfigError(str(error), "dataset") from None

@@ -23,7 +23,8 @@ ResetNeeded. A step after an episode's end does, too, unless the environment res
 
 ``compute_reward`` of RewardModelWrapper raises NotImplementedError: hindsight relabelling would mix the environment's
 rewards with the model's. With a Monitor or RecordEpisodeStatistics inside a wrapper, ``info["episode"]`` has the
-model's summed rewards. They do not see an end by ``terminate_on_success``, so RewardModelWrapper adds the sum there.
+model's summed rewards. These wrappers do not see an end by ``terminate_on_success``, so RewardModelWrapper adds the
+sum there.
 
 A time limit belongs inside the wrapper, as ``gymnasium.make`` puts it. If a reset drops the reward of an unended
 episode, a warning is logged once. In mode ``final``, a second such reset in a row, with no episode end and no error in

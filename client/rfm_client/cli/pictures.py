@@ -96,7 +96,7 @@ def _evenly(positions: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
 
 
 def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, columns: int = 1) -> None:
-    """Draw a picture, in the format given by the file suffix: for each panel the scores, and above them frames in time.
+    """Draw a picture, in the format given by the file suffix: for each panel the scores, and above them some frames.
 
     title: the first line is bold
     columns: panels side by side

@@ -65,8 +65,8 @@ class Table:
 
     columns: headers
     cells: all cells in each column, or stand-ins of the same width
-    names: how many leading columns hold names and paths, which are shortened to fit the terminal; FILE_WIDTH applies to
-        a file or a pipe
+    names: how many leading columns hold names and paths, which are shortened to fit COLUMNS, or else the terminal; a
+        file or pipe gets FILE_WIDTH
     """
 
     def __init__(self, columns: Sequence[str], cells: Sequence[Iterable[str]], *, names: int = 1) -> None:

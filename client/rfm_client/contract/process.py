@@ -114,19 +114,19 @@ def _printable(line: str) -> str:
     return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in line)
 
 
-MOST = 2**16  # some container runtimes allow 2**30, and programs that loop over all descriptors then hang
+MOST_FILES = 2**16  # some container runtimes allow 2**30, and programs that loop over all descriptors then hang
 
 
 def raise_limit() -> int:
-    """Raise this process's limit to the user's maximum, at most MOST, and return it. Children inherit the limit."""
+    """Raise this process's limit to the user's maximum, at most MOST_FILES. Return it; children inherit it."""
     if sys.platform == "win32":
-        return MOST
+        return MOST_FILES
     import resource
 
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    allowed = MOST if hard == resource.RLIM_INFINITY else min(hard, MOST)
+    allowed = MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, MOST_FILES)
     if soft != resource.RLIM_INFINITY and soft < allowed:
         with suppress(OSError, ValueError):  # macOS allows less than it reports
             resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-    return MOST if soft == resource.RLIM_INFINITY else soft
+    return MOST_FILES if soft == resource.RLIM_INFINITY else soft

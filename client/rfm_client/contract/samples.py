@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Samples: questions to a reward model.
+"""Samples: questions to a reward model; blank and random trajectories, for probes and examples.
 
 Letters: T frames, H x W pixels, D frame embedding width, Dt text embedding width.
 Samples check their arrays once, here; all other code relies on it.
@@ -344,7 +344,7 @@ def _check_pair(first: Trajectory, second: Trajectory, where: str) -> None:
         )
 
 
-Widths: TypeAlias = tuple[int, int] | None
+Widths: TypeAlias = tuple[int, int] | None  # D and Dt of the embeddings that a model reads; None: raw frames
 
 BLANK_FRAMES = 2
 SIDE_PX = 64

@@ -29,6 +29,7 @@ from rfm_client.frames.video_decoding import (
     Packets,
     Upright,
     check_is_one_episode,
+    check_upright,
     import_av,
     judged,
     read_packets,
@@ -105,6 +106,7 @@ def read_video(
             picture = None if is_part or container is not None else _still(file)
             if picture is not None:
                 return picture[np.newaxis]
+            check_upright(file)
             packets = read_packets(file, container)
             if not packets.fps and (is_part or fps is not None):
                 raise FrameFileError.of("a frame rate", "none")

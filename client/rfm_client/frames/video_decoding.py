@@ -86,7 +86,6 @@ class Packets:
 
     count: packets whose frames are shown; equals the frame count unless a packet holds several frames
     times_s: float64 [N], sorted time stamps; packets without a time stamp are left out
-    num_bytes: sizes of these N packets
     num_hidden: packets that are not shown, as in videos cut without encoding
     tick_s: time stamp unit, in seconds
     fps: average frames per second; 0: the file does not give it
@@ -94,7 +93,6 @@ class Packets:
 
     count: int
     times_s: npt.NDArray[np.float64]
-    num_bytes: tuple[int, ...]
     num_hidden: int
     tick_s: float
     fps: float
@@ -114,8 +112,7 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
     is read as far as possible.
     """
     _check_ends(file)
-    _check_upright(file)
-    timed: list[tuple[float, int]] = []
+    times_s: list[float] = []
     count = num_hidden = 0
     with import_av().open(file, format=container) as opened:
         stream = video_stream(opened)
@@ -133,12 +130,10 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
             if packet.is_corrupt:
                 raise FrameFileError.of("a whole video file", f"one whose packet {count} is broken ({DOWNLOAD})")
             if packet.pts is not None:
-                timed.append((float(packet.pts * packet.time_base), packet.size))
+                times_s.append(float(packet.pts * packet.time_base))
             count += 1
         tick_s, fps = float(stream.time_base), float(stream.average_rate or 0)
-    timed.sort()
-    times_s = np.array([time_s for time_s, _ in timed])
-    return Packets(count, times_s, tuple(size for _, size in timed), num_hidden, tick_s, fps)
+    return Packets(count, np.sort(np.array(times_s, np.float64)), num_hidden, tick_s, fps)
 
 
 def _check_ends(file: BinaryIO) -> None:
@@ -162,7 +157,7 @@ def _check_ends(file: BinaryIO) -> None:
         raise FrameFileError.of("a whole video file", f"one that ends inside a picture, after {num_bytes} bytes")
 
 
-def _check_upright(file: BinaryIO) -> None:
+def check_upright(file: BinaryIO) -> None:
     """Raise FrameFileError for PNG or WebP pictures with an EXIF orientation.
 
     PyAV before 17.1 ignores it, and PyAV 19 turns only the first picture in an APNG file.

@@ -23,6 +23,7 @@ from rfm_client.frames.video_decoding import (
     Packets,
     Upright,
     check_is_one_episode,
+    check_upright,
     decoder,
     import_av,
     judged,
@@ -57,6 +58,7 @@ class Video:
         av = import_av()
         try:
             with self.file.open("rb") as opened:
+                check_upright(opened)
                 return read_packets(opened, self.container)
         except FileNotFoundError as error:
             raise FrameFileError.of("a video file", "none") from error

@@ -69,8 +69,8 @@ def check_size(inputs: Tensors, shared: Collection[str]) -> None:
         max(sizes, key=lambda name: sizes[name]),
         f"at most {MAX_REQUEST_BYTES / _BYTES_PER_GB:.2f} GB in a request",
         f"{sum(sizes.values()) / _BYTES_PER_GB:.2f} GB",
-        "shrink the frames (resize, --resize), score fewer (subsample, --fps), or share memory with a server on "
-        "this host (shared_memory)",
+        "shrink the frames (resize, --resize), score fewer (subsample, or --fps for videos), or share memory with a "
+        "server on this host (shared_memory)",
     )
 
 

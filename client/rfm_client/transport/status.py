@@ -172,6 +172,18 @@ class ServerStatus:
         timeout_s: float = 60.0,
         credentials: Credentials | None = None,
     ) -> ServerStatus:
+        """Return ``read_async``'s result outside of an event loop. Arguments and errors are the same."""
+        return asyncio.run(cls.read_async(url, metrics_url=metrics_url, timeout_s=timeout_s, credentials=credentials))
+
+    @classmethod
+    async def read_async(
+        cls,
+        url: str,
+        *,
+        metrics_url: str | None = None,
+        timeout_s: float = 60.0,
+        credentials: Credentials | None = None,
+    ) -> ServerStatus:
         """Return the status of the server at ``grpc://host:port`` or ``http://host:port`` (TLS: ``grpcs``, ``https``).
 
         metrics_url: where to read metrics; None: port METRICS_PORT on the same host. Unreadable metrics are left out
@@ -182,14 +194,14 @@ class ServerStatus:
         """
         metrics_url = metrics_url or f"http://{split_url(url)[1].rpartition(':')[0]}:{METRICS_PORT}/metrics"
         try:
-            version, is_ready, models = asyncio.run(_state(url, timeout_s, credentials))
+            version, is_ready, models = await _state(url, timeout_s, credentials)
         except DeadlineExceededError as late:
-            raise DeadlineExceededError(f"{late.server}: no answer within {timeout_s:g} s") from late
+            raise DeadlineExceededError(f"{late.server or url}: no answer within {timeout_s:g} s") from late
         except WRONG_PORT_ERRORS as error:
-            if named := wrong_port(url):
+            if named := await asyncio.to_thread(wrong_port, url):
                 raise ServerUnavailableError(named) from error
             raise
-        metrics = _read_metrics(metrics_url, timeout_s)
+        metrics = await asyncio.to_thread(_read_metrics, metrics_url, timeout_s)
         read = tuple(_model(entry, done, {*models}, metrics) for entry, done in models.values())
         return cls(url, version, is_ready, read, metrics_url, metrics.error, metrics.devices)
 

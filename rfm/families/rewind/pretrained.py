@@ -153,6 +153,8 @@ def load_config(source: str | Path, known: Sequence[str]) -> Any:
     from transformers import AutoConfig
 
     folder = local_copy(source)
+    if not is_there(folder / NETWORK_CONFIG):
+        raise OSError(f"{source}: expected {NETWORK_CONFIG}, got none")
     kind = read_json(folder / NETWORK_CONFIG).get("model_type")
     if kind not in known:
         raise ValueError(f"{source}: model_type: expected one of {', '.join(known)}, got {kind}")

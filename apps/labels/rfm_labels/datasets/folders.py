@@ -220,7 +220,7 @@ class VideoFolder(EpisodeFiles):
         return file_identity(self.root / episode.name, verify=verify)
 
     def check(self, episode: DatasetEpisode, camera: str) -> None:
-        self._length(episode.name)  # finds all packets
+        """Check nothing more: ``read_episode`` has read all packets."""
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         file = self.root / episode.name

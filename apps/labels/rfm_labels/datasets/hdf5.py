@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 
 from rfm_client import RewardError, UInt8Array
 from rfm_client.frames import Orientation, Picture
+from rfm_client.options import first_names
 from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, FaultsError, require
 from rfm_labels.datasets.hdf5_layouts import (
@@ -99,7 +100,7 @@ class Hdf5Dataset(Dataset):
             }
             self._broken = unread_documents(attributes)
             others = unread(opened, self._demos.values()) if self._layout.is_in_data else []
-            notes = [*others, *notes]
+            notes = [*others, *notes, *_notes_on_samples(demos, self._lengths, self._layout.skipped)]
             notes += [
                 f"data: {name} is not a JSON object, so it states neither a task nor LIBERO" for name in self._broken
             ]
@@ -251,6 +252,20 @@ def _one_length(lengths: Mapping[str, int]) -> int:
     of_cameras = {length for key, length in lengths.items() if key != _ACTIONS}
     length = of_cameras.pop() if len(of_cameras) == 1 else 0
     return length if lengths.get(_ACTIONS, length) in (length, length - 1) else 0
+
+
+def _notes_on_samples(
+    demos: Mapping[int, tuple[str, Any]], lengths: Mapping[int, Mapping[str, int]], skipped: int
+) -> list[str]:
+    """Return a note on demonstrations whose ``num_samples`` contradicts their frames; empty if there are none."""
+    differing = []
+    for number, (name, demo) in demos.items():
+        length = _one_length(lengths[number])
+        count = attribute(demo.attrs, "num_samples") if length else None
+        if count is not None and count - skipped not in lengths[number].values():
+            differing.append(f"{name} ({count}, has {length})")
+    every = "each observation gets a label"
+    return [f"lengths: num_samples differs: {first_names(differing)}: {every}"] if differing else []
 
 
 def _notes(uncorrected: Sequence[str], is_libero: bool) -> Sequence[str]:

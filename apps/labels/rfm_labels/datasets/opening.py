@@ -246,13 +246,14 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
         dataset = _KINDS[kind][0](Contents(table.parent, tasks, table, task, corrections))
         dataset.notes = [*dataset.notes, *_unlisted(table, kind, tasks)]
         return dataset
+    require(path, path.is_dir(), _LAYOUTS, "neither")
     kind, names = _listed(path)
     reader, episode = _KINDS[kind]
-    is_of_before = (path / "tasks.json").is_file()  # from 0.4
-    is_task_known = (task.text is not None or kind in _OWN_TASKS) and not is_of_before
+    expected, old_table = f"{TABLE} with the task of each {episode}", path / "tasks.json"  # as 0.4 read it
+    got = f"{old_table.name}: write it as {TABLE}, with the columns video and task"
+    require(path, not old_table.is_file(), expected, got)
     got = f"none: write it, or, if all of them have one task, give it: {_GIVE_TASK}"
-    got = f"tasks.json: write it as {TABLE}, with the columns video and task" if is_of_before else got
-    require(path, is_task_known, f"{TABLE} with the task of each {episode}", got)
+    require(path, task.text is not None or kind in _OWN_TASKS, expected, got)
     return reader(Contents(path, dict.fromkeys(names), path, task, corrections))
 
 
@@ -305,6 +306,11 @@ def _found(folder: Path) -> dict[str, list[str]]:
     return {kind: in_natural_order(names) for kind, names in found.items() if names}
 
 
+def _is_visible(file: Path) -> bool:
+    """True for a file, but not for a hidden one, as macOS adds."""
+    return file.is_file() and not file.name.startswith(".")
+
+
 def _is_frame(file: Path) -> bool:
     return is_picture(file) and not _OUR_FILES.fullmatch(file.name)
 
@@ -329,7 +335,7 @@ def _unread(path: Path) -> str | None:
     if any(_is_frame(file) for file in path.iterdir()):
         return "pictures outside of the folder of an episode"
     suffixes = {**dict.fromkeys(_VIDEO_SUFFIXES, "videos"), **dict.fromkeys(PICTURE_SUFFIXES, "pictures")}
-    deeper = next((file for file in path.rglob("*") if file.suffix.lower() in suffixes), None)
+    deeper = next((file for file in path.rglob("*") if file.suffix.lower() in suffixes and _is_visible(file)), None)
     if deeper is None:
         return None
     kind = suffixes[deeper.suffix.lower()]

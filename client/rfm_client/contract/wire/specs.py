@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Model and request names; tensor names, types and dimensions; frame digests.
+"""Names of models, requests and the admin key's variable; tensor names, types and dimensions; frame digests.
 
 Letters as in the package.
 """
