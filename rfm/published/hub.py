@@ -6,13 +6,12 @@ from __future__ import annotations
 import difflib
 import logging
 import re
-import shlex
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from rfm.files import HUB_FILES, HUB_WEIGHTS, RUN_CONFIG, WEIGHTS, CheckpointError, cut, is_there, shown
 from rfm.published.provenance import snapshot_of
-from rfm.published.weights import PICKLE_STEM, pickled_weights
+from rfm.published.weights import refuse_pickles
 from rfm_client.contract.hub_access import HubError, hub_errors, unreachable
 
 _log = logging.getLogger(__name__)
@@ -105,7 +104,7 @@ def _cached_revision(repo_id: str, down: str, say: Callable[[str], object]) -> s
 
 def _snapshot(repo_id: str, subfolder: str, tag: str | None, path: Path, *, is_down: bool) -> Path:
     """Return a revision's folder in the Hub's cache, with all files that are read. tag: None: main."""
-    from huggingface_hub import snapshot_download
+    from huggingface_hub import HfApi, snapshot_download
 
     patterns, run_configs = HUB_FILES, [RUN_CONFIG]
     if subfolder:
@@ -115,7 +114,9 @@ def _snapshot(repo_id: str, subfolder: str, tag: str | None, path: Path, *, is_d
     snapshot = Path(snapshot_download(repo_id, revision=tag, allow_patterns=patterns, local_files_only=is_down))
     folder = snapshot / subfolder
     if not is_down and not any(folder.rglob(HUB_WEIGHTS)):
-        _refuse_pickles(repo_id, subfolder, tag)
+        files = [Path(file.rfilename) for file in HfApi().model_info(repo_id, revision=tag).siblings or ()]
+        names = (file.name for file in files if file.parent == Path(subfolder))
+        refuse_pickles(f"{repo_id}@{tag or 'main'}", WEIGHTS, names)
     if not any(is_there(snapshot / name) for name in run_configs):  # upstream tags the commit before its upload
         _fetch_run_config_of_main(repo_id, run_configs, is_down=is_down)
     if not folder.is_dir():
@@ -123,22 +124,6 @@ def _snapshot(repo_id: str, subfolder: str, tag: str | None, path: Path, *, is_d
             f"{repo_id}@{tag or 'main'}", f"the folder {subfolder}", f"none of this name{_near(path)}"
         )
     return folder
-
-
-def _refuse_pickles(repo_id: str, subfolder: str, tag: str | None) -> None:
-    from huggingface_hub import HfApi
-
-    files = [Path(file.rfilename) for file in HfApi().model_info(repo_id, revision=tag).siblings or ()]
-    names = pickled_weights((file.name for file in files if file.parent == Path(subfolder)), PICKLE_STEM)
-    if names:
-        revision = "" if tag is None else f" --revision {shlex.quote(tag)}"
-        fetch = f"hf download {repo_id}{revision} --local-dir FOLDER"
-        got = (
-            f"{cut(', '.join(names))}: pickles may run code when they are loaded, so none is fetched. If you trust who "
-            f"made it: {fetch}, then name {Path('FOLDER', subfolder)} as the checkpoint, and the refusal says "
-            "how to convert it"
-        )
-        raise CheckpointError.at(f"{repo_id}@{tag or 'main'}", WEIGHTS, got)
 
 
 def _near(path: Path) -> str:

@@ -165,7 +165,7 @@ def adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Te
     scaling = Scaling.of(file, adapter_config)
     check_adapter(file, adapter_config)
     if not is_there(folder / ADAPTER_WEIGHTS):
-        refuse_pickles(folder, ADAPTER_WEIGHTS, Path(ADAPTER_WEIGHTS).stem)
+        refuse_pickles(folder, ADAPTER_WEIGHTS, [path.name for path in folder.iterdir()])
     tensors = renamed(read_tensors(folder / ADAPTER_WEIGHTS), ADAPTER_NAMES)
     root = WHOLE if any(name.startswith(_PARTS) for name in tensors) else TEXT
     adapter = renamed(tensors, QWEN_NAMES)

@@ -6,9 +6,8 @@ Every format has a rename table, which maps weight names to VlmRewardModel's.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -16,9 +15,8 @@ from torch import Tensor
 
 from rfm.config import CheckpointConfig
 from rfm.families.robometer.checkpoint import VlmCheckpoint, restore
-from rfm.families.robometer.collator import VlmCollator
 from rfm.families.robometer.network import VlmConfig
-from rfm.families.robometer.prompts import OLD_RUN_REMEDY
+from rfm.families.robometer.prompts import OLD_RUN_REMEDY, VlmCollator
 from rfm.files import (
     ADAPTER_CONFIG,
     NETWORK_CONFIG,
@@ -61,42 +59,6 @@ from rfm.qwen.network import BACKBONES, QWEN3, QWEN_2_5
 from rfm.saved import PROCESSOR_FOLDER, is_saved
 
 
-@dataclass(frozen=True)
-class PublishedVlm(VlmCheckpoint):
-    """A checkpoint as it was published.
-
-    base_model: folder or id from the caller; None: as the checkpoint names it
-    has_processor: the processor is the checkpoint's own
-    """
-
-    base_model: str | None = None
-    has_processor: bool = False
-
-    def load_collator(self) -> VlmCollator:
-        """Return the collator. Raises CheckpointError if the caller's base model differs from the run's."""
-        collator = super().load_collator()
-        if self.base_model is not None and _is_published(self.config.base_model_id, self.config.family):
-            _check_published(collator, self.base_model)
-        return collator
-
-    def notes(self) -> list[str]:
-        """Return one line per sign that prompts, images or positions differ from those in training."""
-        lines = []
-        if not self.has_processor and (found := _differences(self.collator)):
-            known = f"the published processors of {self.config.family}"
-            lines.append(f"base model {self.processor}: differs from {known} in {'; '.join(found)}")
-        version = str(self.config.backbone.get("transformers_version"))
-        major = version.partition(".")[0]
-        reads_videos = self.config.family == QWEN_2_5 and not self.config.multi_image
-        if reads_videos and major.isdigit() and int(major) >= 5:
-            lines.append(
-                f"{NETWORK_CONFIG}: transformers_version is {version}: text behind a video stands where transformers 4 "
-                "puts it; if the run was trained with transformers 5, which puts it elsewhere, scores differ from the "
-                "run's"
-            )
-        return lines
-
-
 def reads(folder: Path) -> bool:
     """True if the folder holds an adapter, a network on a known backbone, or LeRobot's Robometer."""
     if is_there(folder / ADAPTER_CONFIG):
@@ -115,11 +77,30 @@ def load(folder: Path, options: CheckpointConfig) -> Loaded:
         parts, assumptions = _published(folder, options)
     config, weights, factors, processor = parts
     config, weights, factors = rounded_as_asked(config, weights, factors, options.weights)
-    base = options.base_model
-    has_processor = base is None and isinstance(processor, Path)
-    checkpoint = PublishedVlm(config, weights, base or processor, factors, base, has_processor)
+    has_processor = options.base_model is None and isinstance(processor, Path)
+    checkpoint = VlmCheckpoint(config, weights, options.base_model or processor, factors)
     checkpoint.check()
-    return Loaded(checkpoint, assumptions, checkpoint.notes)
+    return Loaded(checkpoint, assumptions, lambda: _notes(checkpoint, has_processor=has_processor))
+
+
+def _notes(checkpoint: VlmCheckpoint, *, has_processor: bool) -> list[str]:
+    """Return one line per sign that prompts, images or positions differ from those in training.
+
+    has_processor: the processor is the checkpoint's own
+    """
+    config, lines = checkpoint.config, []
+    if not has_processor and (found := _differences(checkpoint.collator)):
+        known = f"the published processors of {config.family}"
+        lines.append(f"base model {checkpoint.processor}: differs from {known} in {'; '.join(found)}")
+    version = str(config.backbone.get("transformers_version"))
+    major = version.partition(".")[0]
+    if config.family == QWEN_2_5 and not config.multi_image and major.isdigit() and int(major) >= 5:
+        lines.append(
+            f"{NETWORK_CONFIG}: transformers_version is {version}: text behind a video stands where transformers 4 "
+            "puts it; if the run was trained with transformers 5, which puts it elsewhere, scores differ from the "
+            "run's"
+        )
+    return lines
 
 
 _Parts: TypeAlias = tuple[VlmConfig, dict[str, Tensor], dict[str, Tensor], str | Path]
@@ -234,59 +215,26 @@ def _used(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tupl
     return weights, {name: tensor for name, tensor in factors.items() if changed_by(name) in weights}
 
 
-# The published processors by backbone family, with which a run's own is compared.
-_EXAMPLE = "TASK"
+# The published processors by backbone family, with which another is compared.
 _QWEN_PROMPT = "<|im_start|>user\nTASK{visual} 1: <|vision_start|><|{pad}_pad|><|vision_end|><|im_end|>\n"
-_PUBLISHED_NAMES = {
-    QWEN_2_5: r"Qwen/Qwen2\.5-VL-\w+-Instruct",
-    QWEN3: r"Qwen/Qwen3-VL-\w+-Instruct",
-}
 _FACTS: dict[str, dict[str, Any]] = {
     QWEN_2_5: {
         "prompt": f"<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n{_QWEN_PROMPT}",
-        "patch_size": 14,
-        "image_mean": [0.48145466, 0.4578275, 0.40821073],
-        "image_std": [0.26862954, 0.26130258, 0.27577711],
+        "image_mean": (0.48145466, 0.4578275, 0.40821073),
+        "image_std": (0.26862954, 0.26130258, 0.27577711),
     },
-    QWEN3: {"prompt": _QWEN_PROMPT, "patch_size": 16, "image_mean": [0.5] * 3, "image_std": [0.5] * 3},
+    QWEN3: {"prompt": _QWEN_PROMPT, "image_mean": (0.5,) * 3, "image_std": (0.5,) * 3},
 }
-
-
-def _is_published(base_model_id: str, family: str) -> bool:
-    """True for a base model whose published processor is known."""
-    return re.fullmatch(_PUBLISHED_NAMES[family], base_model_id) is not None
-
-
-def _facts(collator: VlmCollator) -> dict[str, Any]:
-    """Return a processor's effect as JSON: a conversation's text with an image or video, and image settings."""
-    visual = Visual.IMAGE if collator.config.multi_image else Visual.VIDEO
-    images = {**collator.images.to_config()}
-    del images["rescale_factor"]  # the same for every processor that loads
-    for name in ("image_mean", "image_std"):
-        images[name] = list(images[name])
-    return {"prompt": Chat(collator.tokenizer).text((_EXAMPLE, visual)), **images}
-
-
-def _check_published(collator: VlmCollator, processor: str) -> None:
-    """Raise CheckpointError if a processor that replaces a published one differs from it."""
-    found = _differences(collator)
-    if found:
-        named = collator.config.base_model_id
-        raise CheckpointError(
-            f"base model {processor}: expected a processor like that of {named}, which the run names: "
-            f"{'; '.join(found)}; name a folder with the files of {named} with --base-model, or correct "
-            "model.base_model_id of the run's config.yaml"
-        )
 
 
 def _differences(collator: VlmCollator) -> list[str]:
     """Return the differences between a processor and those published for its backbone family."""
-    words = (
-        {"visual": "Picture", "pad": "image"} if collator.config.multi_image else {"visual": "Video", "pad": "video"}
-    )
+    is_image = collator.config.multi_image
+    words = {"visual": "Picture", "pad": "image"} if is_image else {"visual": "Video", "pad": "video"}
     known = {**_FACTS[collator.config.family]}
     known["prompt"] = known["prompt"].format(**words)
-    got = _facts(collator)
+    text = Chat(collator.tokenizer).text(("TASK", Visual.IMAGE if is_image else Visual.VIDEO))
+    got = {"prompt": text, **collator.images.to_config()}
     return [f"{name}: expected {value!r}, got {got[name]!r}" for name, value in known.items() if got[name] != value]
 
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -152,23 +151,18 @@ CONTRADICTIONS: dict[str, tuple[str, str, object, str]] = {
     "chat template": ("chat_template.json", "chat_template", "Hello.", "prompt: expected '<|im_start|>user"),
     "image statistics": (
         *("preprocessor_config.json", "image_mean", [0.485, 0.456, 0.406]),
-        "image_mean: expected [0.5, 0.5, 0.5], got [0.485, 0.456, 0.406]",
+        "image_mean: expected (0.5, 0.5, 0.5), got (0.485, 0.456, 0.406)",
     ),
 }
 
 
 @pytest.mark.parametrize(("file", "key", "value", "expected"), CONTRADICTIONS.values(), ids=CONTRADICTIONS)
-def test_a_processor_unlike_the_published_one_is_refused_or_noted_if_the_run_names_it(
+def test_a_processor_unlike_the_published_one_is_noted(
     vlm: Copy, file: str, key: str, value: Any, expected: str
 ) -> None:
     folder, base = vlm(PLAIN)
     rewritten(base / file, lambda content: content.update({key: value}))
-    message = f"base model {base}: expected a processor like that of Qwen/{OF_QWEN_3}, which the run names: {expected}"
-    with pytest.raises(CheckpointError, match=f"^{re.escape(message)}") as refused:
-        notes(folder, base)
-    assert f"; name a folder with the files of Qwen/{OF_QWEN_3} with --base-model, or " in str(refused.value)
-    rewritten(folder / "config.yaml", lambda run: run["model"].update(base_model_id=str(base)))
-    (line,) = notes(folder)
+    (line,) = notes(folder, base)
     assert line.startswith(f"base model {base}: differs from the published processors of qwen3_vl in {expected}")
 
 

@@ -19,7 +19,7 @@ from engines import asked_engine
 from reward_models import Reference, references
 from rfm import published
 from rfm.engine import Engine, Execution
-from rfm.families.roboreward.predictor import RoboRewardPredictor
+from rfm.families.roboreward.checkpoint import RoboRewardPredictor
 from rfm.families.roboreward.prompts import as_jpeg, is_unclear, parsed
 from rfm.qwen.backbone import ROOM
 from rfm.qwen.batch import VlmRow

@@ -24,8 +24,8 @@ from engines import TRANSFORMERS, load_engine
 from rfm import published
 from rfm.engine import Engine, Execution
 from rfm.engine.layers import Normalisation, progress_from_logits
-from rfm.families.robometer.collator import VlmCollator
-from rfm.families.robometer.predictor import VlmPredictor
+from rfm.families.robometer.checkpoint import VlmPredictor
+from rfm.families.robometer.prompts import VlmCollator
 from rfm.qwen.backbone import embedded
 from rfm.qwen.images import QwenImages, fitted_size
 from rfm.qwen.network import QWEN_2_5
