@@ -20,14 +20,13 @@ from rfm.families.robometer.prompts import OLD_RUN_REMEDY, VlmCollator
 from rfm.files import (
     ADAPTER_CONFIG,
     NETWORK_CONFIG,
-    WEIGHTS,
     CheckpointError,
     expecting,
     is_there,
     network_config,
     read_json,
 )
-from rfm.published.lora import Scaling, adapted, check_inside, has_adapter
+from rfm.published.lora import adapted, has_adapter, scaled_inside
 from rfm.published.provenance import Assumption
 from rfm.published.qwen import (
     LORA_INSIDE,
@@ -157,13 +156,13 @@ def _trained(folder: Path, content: Mapping[str, Any], base_model: str | None) -
     run = RunConfig.of(folder)
     run.check_model_type()
     check_progress(run.sections, run.file)
-    scaling: Scaling | None
     if content:
         tensors, num_nf4 = read_published(folder, is_nf4)
-        tensors, scaling = _whole(tensors, folder, backbone, run)
+        tensors = renamed(renamed(tensors, LORA_INSIDE), QWEN_NAMES)
+        tensors = scaled_inside(tensors, folder, backbone, run.file, run.sections["peft"])
     else:
-        backbone, tensors, scaling = adapted(folder, base_model or base_of_adapter(folder, run))
-    weights, factors = _used(tensors, scaling)
+        backbone, tensors = adapted(folder, base_model or base_of_adapter(folder, run))
+    weights, factors = _used(tensors)
     config = _config(folder, backbone, run, weights)
     return config, weights, factors, assumptions_of(config, run, base_model, num_nf4)
 
@@ -195,22 +194,9 @@ def _config(
     return config
 
 
-def _whole(
-    tensors: dict[str, Tensor], folder: Path, backbone: Mapping[str, Any], run: RunConfig
-) -> tuple[dict[str, Tensor], Scaling | None]:
-    """Return whole weights, renamed, with LoRA factors among them, and the factors' scaling if there are any."""
-    scaling = None
-    if check_inside(tensors, folder / WEIGHTS):
-        tensors, scaling = renamed(tensors, LORA_INSIDE), Scaling.of(run.file, run.sections["peft"])
-        if is_there(folder / ADAPTER_CONFIG):
-            scaling.check_equal(Scaling.of(folder / ADAPTER_CONFIG, read_json(folder / ADAPTER_CONFIG)))
-    return renamed(tensors, QWEN_NAMES), scaling
-
-
-def _used(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Return the weights that scores depend on, and their LoRA factors; ``scaling``: for these."""
+def _used(tensors: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Return the weights that scores depend on, and their LoRA factors."""
     weights, factors = split(tensors)
-    factors = factors if scaling is None else scaling.scaled(factors)
     weights = {name: tensor for name, tensor in weights.items() if not UNUSED.fullmatch(name)}
     return weights, {name: tensor for name, tensor in factors.items() if changed_by(name) in weights}
 
