@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import difflib
 import logging
 import re
 from collections.abc import Callable, Iterable
@@ -40,7 +39,7 @@ def find(source: str | Path, say: Callable[[str], object] = _log.warning) -> Pat
         raise CheckpointError.at("checkpoint", _SOURCE, got) from error
     match = _ID.fullmatch(str(source))
     if match is None or ".." in Path(source).parts:
-        raise CheckpointError.at("checkpoint", _SOURCE, f"{shown(str(source))}{_near(path)}")
+        raise CheckpointError.at("checkpoint", _SOURCE, shown(str(source)))
     return _fetch(match["repo"], match["subfolder"] or "", match["tag"], path, say)
 
 
@@ -75,12 +74,12 @@ def _fetch(repo_id: str, subfolder: str, tag: str | None, path: Path, say: Calla
         down = unreachable(repo_id, revision=tag)
         with hub_errors():
             tag = tag or (_best_revision(repo_id) if down is None else _cached_revision(repo_id, down, say))
-            return _snapshot(repo_id, subfolder, tag, path, is_down=down is not None)
+            return _snapshot(repo_id, subfolder, tag, is_down=down is not None)
     except HubError as error:
         where = repo_id if tag is None else f"{repo_id}@{tag}"
         why = str(error) if down in (None, str(error)) else f"{down}, and {error}"
         raise CheckpointError(
-            f"{where}: cannot be fetched: {cut(why)}; there is no folder {path.absolute()} either{_near(path)}; "
+            f"{where}: cannot be fetched: {cut(why)}; there is no folder {path.absolute()} either; "
             f"name one, or see to the Hub's name, login and network{_cached(repo_id, subfolder)}"
         ) from error
 
@@ -102,7 +101,7 @@ def _cached_revision(repo_id: str, down: str, say: Callable[[str], object]) -> s
     return revision
 
 
-def _snapshot(repo_id: str, subfolder: str, tag: str | None, path: Path, *, is_down: bool) -> Path:
+def _snapshot(repo_id: str, subfolder: str, tag: str | None, *, is_down: bool) -> Path:
     """Return a revision's folder in the Hub's cache, with all files that are read. tag: None: main."""
     from huggingface_hub import HfApi, snapshot_download
 
@@ -120,20 +119,8 @@ def _snapshot(repo_id: str, subfolder: str, tag: str | None, path: Path, *, is_d
     if not any(is_there(snapshot / name) for name in run_configs):  # upstream tags the commit before its upload
         _fetch_run_config_of_main(repo_id, run_configs, is_down=is_down)
     if not folder.is_dir():
-        raise CheckpointError.at(
-            f"{repo_id}@{tag or 'main'}", f"the folder {subfolder}", f"none of this name{_near(path)}"
-        )
+        raise CheckpointError.at(f"{repo_id}@{tag or 'main'}", f"the folder {subfolder}", "none of this name")
     return folder
-
-
-def _near(path: Path) -> str:
-    """Name the folders beside a missing path that have similar names."""
-    try:
-        names = [beside.name for beside in path.parent.iterdir() if beside.is_dir()]
-    except OSError:
-        return ""
-    alike = difflib.get_close_matches(path.name, names)
-    return f" (but {', '.join(str(path.parent / name) for name in alike)})" if alike else ""
 
 
 def _snapshots(repo_id: str) -> dict[str, Path]:

@@ -176,7 +176,7 @@ def _config(
     if "progress_head.4.weight" not in weights:
         raise CheckpointError.at(folder, "reward heads", "no progress_head.4.weight")
     if "frame_pool_attn.weight" not in weights:
-        raise CheckpointError.at(folder, "frame_pool_attn.weight", f"none: {OLD_RUN_REMEDY}")
+        raise CheckpointError.at(folder, "frame_pool_attn.weight", "none", OLD_RUN_REMEDY)
     network = run.network()
     config = VlmConfig(
         backbone=backbone,

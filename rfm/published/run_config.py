@@ -156,6 +156,26 @@ def training_notes(folder: Path, answered: Collection[str]) -> list[str]:
     return lines
 
 
+# Keys in a config.json of LeRobot's reward models about LeRobot's own pipelines and uploads.
+_LEROBOT_IDLE = {
+    "default_task", "device", "image_key", "input_features", "license", "normalization_mapping", "output_features",
+    "pretrained_path", "pretrained_revision", "private", "push_to_hub", "repo_id", "success_threshold", "tags",
+    "task_key", "type",
+}  # fmt: skip
+
+
+def check_lerobot(content: Mapping[str, Any], file: Path, needed: Collection[str], known: Collection[str]) -> None:
+    """Raise CheckpointError for a key in LeRobot's config.json that is missing, null or unknown.
+
+    needed, known: keys that must have a value, and keys that may be there
+    """
+    if unknown := sorted(content.keys() - _LEROBOT_IDLE - {*needed, *known}):
+        expected = f"the keys of LeRobot's {content['type']}"
+        raise CheckpointError.at(file, expected, shown(unknown[0]), "if it changes no score, remove it")
+    if missing := [key for key in needed if content.get(key) is None]:
+        raise CheckpointError.at(f"{file}: {missing[0]}", "a value", "none", "save the model with LeRobot again")
+
+
 def constant_heads(weights: Mapping[str, Tensor], answered: Collection[str]) -> list[str]:
     """Return one line for the user per head in ``answered`` whose last weight is 0 throughout, as if untrained."""
     heads = {head: weights.get(f"{head}_head.4.weight") for head in answered}

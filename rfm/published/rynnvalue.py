@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -83,9 +83,10 @@ class Settings:
 
     def fields(self) -> dict[str, Any]:
         """Return the fields of RynnConfig that these files decide. Raises CheckpointError."""
+        attention = self._one_of("attn_implementation", self._value("attn_implementation"), (ISOLATED, *_CAUSAL))
         return {
-            "attention": self._attention(),
-            "num_heads": self._count("num_value_heads"),
+            "attention": "isolated" if attention == ISOLATED else "causal",
+            "num_heads": self._whole("num_value_heads", self._value("num_value_heads")),
             "value_copies": self._copies("value_token_repeat"),
             "relative_copies": self._copies("relative_value_token_repeat"),
             "value_head": self._head("value_head_config"),
@@ -110,12 +111,15 @@ class Settings:
     def _file(self) -> Path:
         return self.folder / NETWORK_CONFIG
 
-    def _attention(self) -> str:
-        stated = self._value("attn_implementation")
-        if stated != ISOLATED and stated not in _CAUSAL:
-            expected = f"{ISOLATED} or one of {', '.join(_CAUSAL)}"
-            raise CheckpointError.at(f"{self._file}: attn_implementation", expected, shown(stated))
-        return "isolated" if stated == ISOLATED else "causal"
+    def _one_of(self, key: str, value: Any, known: Iterable[str]) -> str:
+        if value not in [*known]:
+            raise CheckpointError.at(f"{self._file}: {key}", f"one of {', '.join(known)}", shown(value))
+        return str(value)
+
+    def _whole(self, key: str, value: Any, least: int = 1) -> int:
+        if type(value) is not int or value < least:
+            raise CheckpointError.at(f"{self._file}: {key}", f"a whole number of at least {least}", shown(value))
+        return value
 
     def _use_meta(self) -> bool:
         stated = self.processor.get("use_meta")
@@ -129,40 +133,24 @@ class Settings:
             raise CheckpointError.at(f"{self.folder / PROCESSOR_CONFIG}: conversation_style", _STYLE, shown(stated))
 
     def _copies(self, key: str) -> int:
-        count, other = self._count(key), self.processor.get(key)
+        count, other = self._whole(key, self._value(key)), self.processor.get(key)
         if other not in (None, count):
             where = f"{self.folder / PROCESSOR_CONFIG}: {key}"
             raise CheckpointError.at(where, f"{count}, as in {NETWORK_CONFIG}", shown(other), _COPY)
         return count
 
-    def _count(self, key: str) -> int:
-        value = self._value(key)
-        if type(value) is not int or value < 1:
-            raise CheckpointError.at(f"{self._file}: {key}", "a whole number of at least 1", shown(value))
-        return value
-
     def _head(self, key: str) -> HeadConfig:
         read = self._section(key)
-        where = f"{self._file}: {key}"
-        kind, activation = read["head_type"], read["activation"]
-        if kind not in ("bro", "linear"):
-            raise CheckpointError.at(f"{where}.head_type", "bro or linear", shown(kind))
-        if activation not in ACTIVATIONS:
-            raise CheckpointError.at(f"{where}.activation", f"one of {', '.join(ACTIVATIONS)}", shown(activation))
-        for name, least in (("hidden_dims", 1), ("depth", 0)):
-            if type(read[name]) is not int or read[name] < least:
-                raise CheckpointError.at(f"{where}.{name}", f"a whole number of at least {least}", shown(read[name]))
-        return HeadConfig(kind, read["hidden_dims"], read["depth"], activation)
+        kind: Any = self._one_of(f"{key}.head_type", read["head_type"], ("bro", "linear"))
+        activation = self._one_of(f"{key}.activation", read["activation"], ACTIVATIONS)
+        width, depth = (self._whole(f"{key}.{name}", read[name], n) for name, n in (("hidden_dims", 1), ("depth", 0)))
+        return HeadConfig(kind, width, depth, activation)
 
     def _bins(self, key: str) -> Bins:
         read = self._section(key)
         where = f"{self._file}: {key}"
-        transform, count = read["support_transform"], read["bins"]
-        if transform not in get_args(Transform):
-            expected = f"one of {', '.join(get_args(Transform))}"
-            raise CheckpointError.at(f"{where}.support_transform", expected, shown(transform))
-        if type(count) is not int or count < 1:
-            raise CheckpointError.at(f"{where}.bins", "a whole number of at least 1", shown(count))
+        transform: Any = self._one_of(f"{key}.support_transform", read["support_transform"], get_args(Transform))
+        count = self._whole(f"{key}.bins", read["bins"])
         ends = [read[name] for name in ("min_value", "max_value")]
         if not all(map(_is_number, ends)) or ends[0] > ends[1]:
             raise CheckpointError.at(where, "min_value, and a max_value that is not smaller", shown(ends))

@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rfm.files import (
-    ADAPTER_WEIGHTS,
     NETWORK_CONFIG,
-    SHARDS,
     WEIGHTS,
     WEIGHTS_INDEX,
     CheckpointError,
@@ -23,7 +21,6 @@ from rfm.files import (
     read_json,
     read_tensors,
     shown,
-    tensor_names,
 )
 from rfm.weights import check_names
 
@@ -31,9 +28,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-_ENCODERS = ("image_encoder", "text_encoder")  # subfolders in an exported checkpoint
-_LEVELS = ("*", "*/*", "*/*/*")  # how deep checkpoints lie in a training run's folder or in a model repository
-_MAX_SUGGESTED = 5
 _PICKLES = (".bin", ".pt", ".pth", ".ckpt", ".pkl")
 _STATES = ("optimizer", "scheduler", "rng_state", "random_states", "scaler", "training_args")  # to resume training
 # Prefixes that training code puts before weight names. Those in _INSIDE also stand before layer names.
@@ -63,7 +57,8 @@ def read_weights(folder: Path, model_type: str | None = None) -> dict[str, Tenso
     else:
         refuse_pickles(folder, WEIGHTS, [path.name for path in folder.iterdir()])
         got = cut(", ".join(sorted(path.name for path in folder.iterdir()))) or "nothing"
-        raise CheckpointError.at(folder, f"{WEIGHTS} or {WEIGHTS_INDEX}", f"{got}: {_below(folder)}")
+        remedy = "name the folder that has it, beside config.json"
+        raise CheckpointError.at(folder, f"{WEIGHTS} or {WEIGHTS_INDEX}", got, remedy)
     _check_network(folder, weights, model_type)
     return _unwrapped(weights, folder)
 
@@ -87,27 +82,23 @@ def _check_network(folder: Path, names: Iterable[str], model_type: str | None) -
 
 
 def _read_shards(index: Path) -> dict[str, Tensor]:
+    """Return each tensor from the shard that the index names for it."""
     weight_map = read_json(index).get("weight_map")
     if not isinstance(weight_map, dict):
         raise CheckpointError.at(index, "a weight_map", "none")
     weights: dict[str, Tensor] = {}
-    shard_of: dict[str, str] = {}
     for shard in dict.fromkeys(map(str, weight_map.values())):
         if Path(shard).name != shard or not shard.endswith(".safetensors"):
             raise CheckpointError.at(index, "names of files beside it", shown(shard))
         if not is_there(index.parent / shard):
             raise CheckpointError(f"{index}: names the shard {shard}, which is not there")
-        for name, tensor in read_tensors(index.parent / shard).items():
-            if name in shard_of:
-                got = f"{shown(name)} in {shard_of[name]} and in {shard}"
-                raise CheckpointError.at(index, "each tensor in one shard", got, "save the weights again")
-            weights[name], shard_of[name] = tensor, shard
+        tensors = read_tensors(index.parent / shard)
+        if unknown := sorted(tensors.keys() - {name for name, place in weight_map.items() if place == shard}):
+            raise CheckpointError.at(
+                index, f"the tensors in {shard}", f"no {listed(unknown)}", "save the weights again"
+            )
+        weights |= tensors
     check_names(weight_map.keys(), weights.keys())
-    for file in sorted(index.parent.glob(SHARDS)):
-        unknown = set(tensor_names(file)) - shard_of.keys()
-        if unknown:
-            got = f"{file.name}, which it does not name, with {listed(sorted(unknown))}"
-            raise CheckpointError.at(index, "the names of all shards", got, "name a copy of the folder without it")
     return weights
 
 
@@ -130,16 +121,6 @@ def _unwrapped(weights: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]
         remedy = "save the weights again where they were trained, with the prefix before all names or none"
         raise CheckpointError.at(folder, _HEAD, got, remedy)
     return {name.removeprefix(prefix): tensor for name, tensor in bare.items()}
-
-
-def _below(folder: Path) -> str:
-    """Name the checkpoints below a folder that has no weights, or describe a checkpoint's folder."""
-    names = (WEIGHTS, WEIGHTS_INDEX, ADAPTER_WEIGHTS)
-    found = [file.parent for level in _LEVELS for name in names for file in sorted(folder.glob(f"{level}/{name}"))]
-    checkpoints = [str(path) for path in dict.fromkeys(found) if path.name not in _ENCODERS]
-    if not checkpoints:
-        return "a checkpoint's folder has it, beside config.json"
-    return f"name the checkpoint in it: {cut(', '.join(checkpoints[:_MAX_SUGGESTED]))}"
 
 
 def take_prefix(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

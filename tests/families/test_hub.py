@@ -197,17 +197,6 @@ def test_a_base_model_of_the_hub_is_read_from_the_cache_once_the_hub_is_gone(tmp
     files._main_of.cache_clear()
 
 
-def test_a_misspelt_folder_is_named_beside_the_hub_s_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "runs" / "checkpoint").mkdir(parents=True)
-    monkeypatch.chdir(tmp_path)
-    expected = f"there is no folder {tmp_path}/runs/chekpoint@v2 either (but runs/checkpoint); name one, or see"
-    with pytest.raises(CheckpointError, match=re.escape(expected)):
-        published.load("runs/chekpoint@v2")
-    expected = f"got '{tmp_path}/runs/chekpoint' (but {tmp_path}/runs/checkpoint)"
-    with pytest.raises(CheckpointError, match=re.escape(expected)):
-        published.load(tmp_path / "runs" / "chekpoint")
-
-
 TAGS = {
     "the highest score": (["best-x-0.5-step-10", "best-x-0.75-step-5", "main"], "best-x-0.75-step-5"),
     "the first of equals, below 0": (["best-a--0.2-step-9", "best-b--0.2-step-2", "best-c--0.9-step-2"], "best-a--0.2-step-9"),

@@ -53,7 +53,7 @@ IMAGES, VIDEOS, BOTH = "preprocessor_config.json", "video_preprocessor_config.js
 FIRST = "first_embedding_A"  # tensor in a ReWiND's file
 HEAD, EMBEDDING, TIED = "lm_head.weight", "model.language_model.embed_tokens.weight", "tie_word_embeddings"
 
-MAX_HEADER_BYTES = MAX_JSON_BYTES = 2**24  # of what is read
+MAX_JSON_BYTES = 2**24  # of what is read
 MAX_YAML_BYTES = 2**18
 LONGEST_S = 30
 MOST_MEMORY_BYTES = 512 * 2**20  # above the process's peak
@@ -182,13 +182,12 @@ ZEROS = r": expected weights, got 0 throughout: the file is incomplete; fetch or
 DIFFERENT_HEAD = r"text_config\.tie_word_embeddings: expected false, since lm_head.weight differs from the embedding, got true.*transformers 4 scores with the embedding, transformers 5 with the head"
 
 WEIGHT_FILES: dict[str, tuple[str, Spoil, str]] = {
-    "no weights": (REWIND, gone(WEIGHTS), r"expected model.safetensors or .*, got config.*: a checkpoint's folder has it, beside config.json"),
+    "no weights": (REWIND, gone(WEIGHTS), r"expected model.safetensors or .*, got config.*; name the folder that has it, beside config.json"),
     "missing and unexpected keys": (REWIND, weights(lambda w: w.update(surplus=w.pop("success_head.4.bias"))), r"missing keys: \['success_head.4.bias'\]; unexpected keys: \['surplus'\]"),
     "whole and in shards": (REWIND, lambda f: [shutil.copy(f / WEIGHTS, f.parent), in_two_shards(f), shutil.copy(f.parent / WEIGHTS, f)], r"expected model\.safetensors or shards, got model\.safetensors and \['model\.safetensors\.index\.json'\], of which one is older; name a copy without what is not meant"),
     "whole and in shards without an index": (REWIND, lambda f: shutil.copy(f / WEIGHTS, f / "model-00001-of-00002.safetensors"), r"got model\.safetensors and \['model-00001-of-00002\.safetensors'\]"),
     "an encoder whole and in shards": (ENCODED, without_encoders(beside("image_encoder", text("model.safetensors.index.json", '{"weight_map": {}}'))), r"image_encoder: expected model\.safetensors or shards, got"),
-    "a tensor in two shards": (REWIND, both(in_two_shards, shard_twice), r"expected each tensor in one shard, got 'first_embedding_A' in a\.safetensors and in b\.safetensors; save"),
-    "a shard that the index does not name": (REWIND, extra_shard("model-00003-of-00003.safetensors", {"more": torch.ones(1)}), r"expected the names of all shards, got model-00003-of-00003\.safetensors, which it does not name, with \['more'\]; name a copy of the folder without it"),
+    "a tensor in two shards": (REWIND, both(in_two_shards, shard_twice), r"expected the tensors in b\.safetensors, got no \['first_embedding_A', .*; save the weights again"),
     "a lost shard": (REWIND, both(in_two_shards, gone("b.safetensors")), r"names the shard b.safetensors, which is not there"),
     "a shard elsewhere": (REWIND, instead(WEIGHTS, lambda f: Path(f"{f}.index.json").write_text('{"weight_map": {"a": "../secret.safetensors"}}')), r"expected names of files beside it, got '\.\./secret"),
     "a shard with a NUL": (REWIND, instead(WEIGHTS, lambda f: Path(f"{f}.index.json").write_text('{"weight_map": {"a": "a\\u0000.safetensors"}}')), r"expected a file|not there"),
@@ -200,14 +199,13 @@ WEIGHT_FILES: dict[str, tuple[str, Spoil, str]] = {
     "zeros": (TOP, weights(lambda w: [t.zero_() for t in w.values()]), ZEROS),
     "zeros from half of the file on": (Q3, first_half, ZEROS),
     "a file of zeros": (REWIND, lambda f: (f / WEIGHTS).write_bytes(bytes(1000)), SAFETENSORS + "zeros, as after an unfinished download"),
-    "an empty file": (REWIND, lambda f: (f / WEIGHTS).write_bytes(b""), SAFETENSORS + "only 0 bytes"),
-    "a header of 2^63 bytes": (REWIND, lambda f: (f / WEIGHTS).write_bytes(struct.pack("<Q", 2**63) + b"{}"), SAFETENSORS + f"one whose header would be {2**63} bytes long"),
-    "a header that fits but is huge": (REWIND, raw_header(lambda _: b"{" + b" " * MAX_HEADER_BYTES + b"}"), SAFETENSORS + "one whose header would be"),
+    "an empty file": (REWIND, lambda f: (f / WEIGHTS).write_bytes(b""), SAFETENSORS + ".*header too small"),
+    "a header of 2^63 bytes": (REWIND, lambda f: (f / WEIGHTS).write_bytes(struct.pack("<Q", 2**63) + b"{}"), SAFETENSORS + ".*header too large"),
     "a deep header": (REWIND, raw_header(lambda _: b"[" * 2**20), SAFETENSORS),
-    "a tensor twice": (REWIND, raw_header(lambda raw: raw.replace(b"{", f'{{"{FIRST}": {{}}, '.encode(), 1)), SAFETENSORS + f"the key '{FIRST}' twice"),
+    "a tensor twice": (REWIND, raw_header(lambda raw: raw.replace(b"{", f'{{"{FIRST}": {{}}, '.encode(), 1)), SAFETENSORS),
     "offsets beyond the end": (REWIND, header(data_offsets=[0, 2**60]), SAFETENSORS),
     "a shape that lies": (REWIND, header(shape=[1, 1, 10**6]), SAFETENSORS),
-    "a type that is none": (REWIND, header(dtype="PY"), SAFETENSORS + f"'{FIRST}' of type 'PY'"),
+    "a type that is none": (REWIND, header(dtype="PY"), SAFETENSORS + ".*unknown variant `PY`"),
     "whole numbers as weights": (REWIND, header(dtype="I32"), rf"{FIRST}: expected numbers like"),
     "a tail": (REWIND, lambda f: (f / WEIGHTS).write_bytes((f / WEIGHTS).read_bytes() + b"tail"), SAFETENSORS),
     "Git LFS": (REWIND, text(WEIGHTS, "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n"), SAFETENSORS + "Git LFS's note of where it is; `git lfs pull` fetches it"),
@@ -268,7 +266,7 @@ SETTINGS: dict[str, tuple[str, Spoil, str]] = {
     "answers in generated text": (Q3, run_settings("model", model_type="vqa"), r"model\.model_type: expected default, got 'vqa': .* upstream's successor dropped the type"),
     "no reward heads": (Q3, weights(lambda w: w.pop("progress_head.4.weight")), r"expected reward heads, got no progress_head.4.weight"),
     "a run of before 2026-01-21": (Q3, weights(lambda w: w.pop("frame_pool_attn.weight")), r"expected frame_pool_attn\.weight, got none: .* before that day was trained with 8 special tokens"),
-    "eight special tokens": (Q3, eight_special_tokens, r"tokens .*, got 451 \(with 8 special tokens, as upstream before 2026-01-21"),
+    "eight special tokens": (Q3, eight_special_tokens, r"tokens .*, got 451; .*a run of before 2026-01-21 had 8 special tokens"),
     "the processor of another model": (Q3, lambda f: [shutil.rmtree(f.parent / "base_model"), shutil.copytree(goldens.config(Q25).sources["base_model"], f.parent / "base_model")], r"expected a tokenizer of 451 tokens .*, got 447"),
 }  # fmt: skip
 
@@ -344,7 +342,7 @@ IN_WORDS: dict[str, tuple[str, Spoil, str]] = {
     },
     "no language head": (TOP, weights(lambda w: w.pop(HEAD)), r"expected lm_head.weight, since tie_word_embeddings is false, got none"),
     "a template without the video": (TOP, template_of_text, r"chat template: expected one video in a prompt, got 0"),
-    "an unknown key of LeRobot": (TOP_LEROBOT, settings(CONFIG, frame_stride=2), r"expected the keys of LeRobot's TOPReward, got 'frame_stride'"),
+    "an unknown key of LeRobot": (TOP_LEROBOT, settings(CONFIG, frame_stride=2), r"expected the keys of LeRobot's topreward, got 'frame_stride'"),
     "a penalty": (ROBO, settings("generation_config.json", repetition_penalty=1.1), r"repetition_penalty: expected 1.0, got 1.1; remove it"),
     "an unknown key of generation": (ROBO, settings("generation_config.json", suppress_tokens=[1]), r"suppress_tokens: expected no such key, got \[1\]"),
     "no end of an answer": (ROBO, settings("generation_config.json", eos_token_id=None), r"eos_token_id: expected ids of tokens, got None"),
@@ -354,7 +352,7 @@ IN_WORDS: dict[str, tuple[str, Spoil, str]] = {
 OF_LEROBOT: dict[str, tuple[str, Spoil, str]] = {
     name: (LEROBOT, spoil, message)
     for name, spoil, message in [
-        ("an unknown key of Robometer", settings(CONFIG, frame_stride=2), r"expected the keys of LeRobot's Robometer, got 'frame_stride'; if it changes no score, remove it"),
+        ("an unknown key of Robometer", settings(CONFIG, frame_stride=2), r"expected the keys of LeRobot's robometer, got 'frame_stride'; if it changes no score, remove it"),
         ("a missing key", in_json(CONFIG, lambda c: c.pop("use_multi_image")), r"use_multi_image: expected a value, got none; save the model with LeRobot again"),
         ("no theta", of_vlm(lambda c: c["text_config"]["rope_parameters"].pop("rope_theta")), r"vlm_config: text_config.rope_theta: expected a number above 0, got None"),
         ("other bins", settings(CONFIG, progress_discrete_bins=5), r"progress_discrete_bins: expected 10 outputs, as progress_head has, got 5 with progress_loss_type discrete"),
@@ -462,16 +460,6 @@ def test_a_model_with_reward_heads_is_not_asked_in_words() -> None:
 def test_a_source_that_is_neither_folder_nor_id_is_refused(source: str) -> None:
     with pytest.raises(CheckpointError, match="expected a folder that exists or a Hugging Face id"):
         published.load(source)
-
-
-def test_a_run_folder_is_refused_with_its_checkpoints(tmp_path: Path) -> None:
-    for name in ("ckpt-1", "ckpt-2"):
-        with_sources(REWIND, tmp_path / name)
-    in_two_shards(tmp_path / "ckpt-2" / "checkpoint")
-    with pytest.raises(
-        CheckpointError, match=rf"name the checkpoint in it: {tmp_path}/ckpt-1/\w+, {tmp_path}/ckpt-2/\w+"
-    ):
-        published.load(tmp_path)
 
 
 def test_yaml_and_a_base_model_run_no_code(tmp_path: Path) -> None:

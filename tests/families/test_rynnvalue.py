@@ -231,10 +231,10 @@ def test_missing_settings_are_assumed_and_unexpected_keys_are_noted(copied: Path
 
 
 WRONG = {
-    "attention": (lambda c: c.update(attn_implementation="window"), "attn_implementation: expected pred_slot"),
+    "attention": (lambda c: c.update(attn_implementation="window"), "attn_implementation: expected one of pred_slot"),
     "copies": (lambda c: c.update(value_token_repeat=8), "value_token_repeat: expected 8, as in config.json, got 3"),
     "token": (lambda c: c.update(value_token_id=7), "value_token_id: expected 665, the tokenizer's id of <value>"),
-    "head": (lambda c: c["value_head_config"].update(head_type="mlp"), "head_type: expected bro or linear"),
+    "head": (lambda c: c["value_head_config"].update(head_type="mlp"), "head_type: expected one of bro, linear"),
     "width": (
         lambda c: c["value_head_config"].update(hidden_dims=0),
         "hidden_dims: expected a whole number of at least",

@@ -17,7 +17,7 @@ from rfm.engine.family import NETWORK
 from rfm.engine.layers import progress_from_logits
 from rfm.engine.predictor import RowScores, no_success
 from rfm.families.robometer.network import VlmConfig, VlmOutput, VlmRewardModel
-from rfm.families.robometer.prompts import OLD_SPECIAL_TOKENS, SPECIAL_TOKENS, VlmCollator
+from rfm.families.robometer.prompts import OLD_RUN_REMEDY, SPECIAL_TOKENS, VlmCollator
 from rfm.files import NETWORK_CONFIG, CheckpointError, expecting
 from rfm.qwen.batch import VlmBatch, VlmRow
 from rfm.qwen.checkpoint import LORA, QwenCheckpoint
@@ -163,13 +163,8 @@ def load_collator(config: VlmConfig, num_tokens: int, processor: str | Path) -> 
     tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
     if len(tokenizer) != num_tokens:  # upstream resizes the embedding to the tokenizer
         expected = f"a tokenizer of {num_tokens} tokens with the special ones, as the checkpoint's embedding"
-        is_old = num_tokens - len(tokenizer) == OLD_SPECIAL_TOKENS - len(SPECIAL_TOKENS)
-        hint = (
-            f" (with {OLD_SPECIAL_TOKENS} special tokens, as upstream before 2026-01-21, it would fit)"
-            if is_old
-            else ""
-        )
-        raise CheckpointError.at(f"base model {processor}", expected, f"{len(tokenizer)}{hint}")
+        remedy = f"name the run's base model with --base-model; {OLD_RUN_REMEDY}"
+        raise CheckpointError.at(f"base model {processor}", expected, len(tokenizer), remedy)
     _check_special_tokens(config, tokenizer, processor)
     return _collator(config, tokenizer, preprocessor, processor)
 
