@@ -83,35 +83,36 @@ def read_for_export(
     *,
     other_machine: bool,
 ) -> Source:
-    """Read and check all that an export needs, before it writes. Parameters and errors: see ``export``."""
+    """Read and check all that an export needs, before it writes. Parameters and errors: see ``export``.
+
+    Tell the user which file has the training run's settings, and about possible faults.
+    """
     if not other_machine:
         _check_gpus(settings.num_gpus)
     named = None if device is None else device_named(device)
-    read = read_source(source, settings, family, say)
-    _check_graphs(settings, read.checkpoint.description)
-    return replace(read, settings=with_batch_size(settings, read.checkpoint, say), device=named)
-
-
-def read_source(source: str | Path, settings: ExportConfig, family: str | None, say: Printer) -> Source:
-    """Read a checkpoint. Tell the user which file has the training run's settings, and about possible faults."""
     folder = published.find(source, say)
     kind = published.choose(folder, family, settings)
     loaded = published.read_from(folder, kind, settings)
-    checkpoint = loaded.checkpoint
+    checkpoint, encoders = loaded.checkpoint, loaded.encoders()
     check_links(folder)
-    encoders = loaded.encoders()
     if (run_config := find_run_config(folder)) is not None:
         say(f"{run_config}: read as the settings of the training run")
     for note in published.notes(folder, loaded):
         say(note)
     gpus = num_gpus(settings)
-    computed = computation(checkpoint, settings.torch_dtype, on_gpu=gpus > 0)
-    origin = origin_of(source, folder, computed)
-    of_encoders = None if encoders is None else described_encoders(encoders.description, origin)
-    full = None if settings.weights is None else partial(_full, folder, kind, settings)
-    description = described(checkpoint, origin)
+    origin = origin_of(source, folder, computation(checkpoint, settings.torch_dtype, on_gpu=gpus > 0))
+    _check_graphs(settings, checkpoint.description)
     return Source(
-        kind, checkpoint, tuple(loaded.assumptions), encoders, description, of_encoders, settings, gpus, None, full
+        kind,
+        checkpoint,
+        tuple(loaded.assumptions),
+        encoders,
+        described(checkpoint, origin),
+        None if encoders is None else described_encoders(encoders.description, origin),
+        with_batch_size(settings, checkpoint, say),
+        gpus,
+        named,
+        None if settings.weights is None else partial(_full, folder, kind, settings),
     )
 
 

@@ -29,26 +29,22 @@ Batch = TypeVar("Batch")
 
 
 class Predictor(Protocol[Row, Batch]):
-    """A network on a device, with batch collation.
+    """A network on a device, with batch collation. A subclass gets what most families have in common.
 
     A row is one token sequence, or several that begin alike.
+
+    has_progress: False if the network does not predict progress, which is then NaN
+    reads_views: True if the network reads a goal and views from further cameras
+    works_ahead: True if ``work_ahead`` takes enough time to be worth a thread
     """
 
-    @property
-    def has_progress(self) -> bool:
-        """False if the network does not predict progress, which is then NaN."""
+    has_progress: bool = True
+    reads_views: bool = False
+    works_ahead: bool = False
 
     @property
     def has_success(self) -> bool:
         """False if the network does not predict success, which is then NaN."""
-
-    @property
-    def reads_views(self) -> bool:
-        """True if the network reads a goal and views from further cameras."""
-
-    @property
-    def works_ahead(self) -> bool:
-        """True if ``work_ahead`` takes enough time to be worth a thread."""
 
     def rows(self, sample: Sample) -> list[Row]:
         """Return the sample's rows, without a forward pass: one, or one per prefix to score.
@@ -61,9 +57,11 @@ class Predictor(Protocol[Row, Batch]):
 
     def sequences(self, row: Row) -> Sequence[Row]:
         """Return the row's token sequences, each as a row. Most rows have one."""
+        return (row,)
 
     def work_ahead(self, rows: Sequence[Row]) -> None:
-        """Do the slow, independent work on these rows; thread-safe. ``collate`` does the rest."""
+        """Do the slow, independent work on these rows, if any; thread-safe. ``collate`` does the rest."""
+        return
 
     def collate(self, rows: Sequence[Row]) -> Batch:
         """Return one batch; may run while the device computes."""
@@ -79,6 +77,7 @@ class Predictor(Protocol[Row, Batch]):
 
     def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
         """Return frame scores for a progress sample, from all row scores."""
+        return of_rows(sample, rows)
 
 
 class GraphedPredictor(Predictor[Row, Batch], Protocol):

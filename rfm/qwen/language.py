@@ -24,7 +24,7 @@ from rfm.qwen.backbone import Box, KeyValues, positions
 from rfm.qwen.batch import VlmBatch, VlmRow
 from rfm.qwen.checkpoint import QwenCheckpoint
 from rfm.qwen.collator import VIDEO_PAD, VISION_END, VISION_START, QwenCollator, expanded, timed_groups, video_of
-from rfm.qwen.images import MERGE, QwenImages
+from rfm.qwen.images import MERGE, BoundedImages, QwenImages
 from rfm.qwen.network import BackboneConfig, qwen_states
 from rfm.qwen.processor import (
     SIZED_BY_PROCESSOR,
@@ -36,6 +36,7 @@ from rfm.qwen.processor import (
 from rfm.qwen.video import Indices, VlmVideo
 from rfm.saved import REWARD_MODEL, Saved
 from rfm_client.contract import ProgressSample, Sample
+from rfm_client.contract.description import Description
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -172,10 +173,11 @@ class LanguageCheckpoint(QwenCheckpoint):
     """A Qwen3-VL in memory that is prompted in words.
 
     weights: for LanguageNetwork; with the head only if it is not tied to the embedding
-    made_of: the configuration class
+    made_of, collator_of: the classes of the configuration and the collator
     """
 
     made_of: ClassVar[type[LanguageConfig]]
+    collator_of: ClassVar[Any]
     network_of: ClassVar[Any] = LanguageNetwork
     reads_videos: ClassVar[bool] = True  # otherwise separate images
     has_language_head: ClassVar[bool] = True
@@ -193,7 +195,7 @@ class LanguageCheckpoint(QwenCheckpoint):
         checkpoint.check()
         return checkpoint
 
-    def load_collator(self) -> LanguageCollator:
+    def load_collator(self) -> Any:
         """Return the sample collator. Raises CheckpointError if the processor is missing or does not fit."""
         tokenizer, preprocessor = read_processor(self.processor, videos=self.reads_videos)
         num_rows = self.config.backbone["text_config"]["vocab_size"]
@@ -226,6 +228,15 @@ class LanguageCheckpoint(QwenCheckpoint):
             network.lm_head.weight = network.model.language_model.embed_tokens.weight
         return network
 
-    def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> LanguageCollator:
+    def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> Any:
         """Return the collator with this tokenizer and preprocessing."""
-        raise NotImplementedError
+        return self.collator_of(self.config, tokenizer, self.images(patch_px, normalisation))
+
+    def images(self, patch_px: int, normalisation: Normalisation) -> QwenImages:
+        """Return the preprocessing; by default that of separate images whose pixels the configuration bounds."""
+        return BoundedImages(patch_px, normalisation, least_px=self.config.least_px, most_px=self.config.most_px)
+
+    def described(self, kind: str, **facts: Any) -> Description:
+        """Return the description of a model of this kind. facts: what not all such models have in common"""
+        network = {"class": self.network_of.__name__}
+        return Description(kind=kind, network=network, asks_in_words=True, keeps_features=True, is_large=True, **facts)

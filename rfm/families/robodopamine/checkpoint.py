@@ -5,18 +5,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from rfm.engine.execution import Execution
-from rfm.engine.layers import Normalisation
 from rfm.engine.predictor import RowScores, no_success
 from rfm.families.robodopamine.answers import QUESTIONS, fused, hops, parsed, sampled_frames
 from rfm.families.robodopamine.prompts import RoboDopamineCollator, RoboDopamineConfig
 from rfm.qwen.batch import VlmRow
-from rfm.qwen.images import BoundedImages
-from rfm.qwen.language import LanguageCheckpoint, LanguageNetwork
+from rfm.qwen.language import LanguageCheckpoint
 from rfm.qwen.written import WritingPredictor, WrittenAnswer, progress_of
 from rfm_client.contract import FrameScores, Sample
 from rfm_client.contract.description import Description
@@ -57,24 +55,16 @@ class RoboDopamineCheckpoint(LanguageCheckpoint):
 
     made_of = RoboDopamineConfig
     predictor_of = RoboDopaminePredictor
+    collator_of = RoboDopamineCollator
     reads_videos: ClassVar[bool] = False
 
     @property
     def description(self) -> Description:
         """The model's inputs and outputs."""
-        return Description(
-            kind=f"Robo-Dopamine, {self.config.mode}",
-            network={"class": LanguageNetwork.__name__},
+        return self.described(
+            f"Robo-Dopamine, {self.config.mode}",
             more_scores=("hop",),
             needs_whole_episode=True,
             reads_views=True,
             may_not_answer=True,
-            asks_in_words=True,
-            keeps_features=True,
-            is_large=True,
         )
-
-    def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> RoboDopamineCollator:
-        """Return the collator with this tokenizer and preprocessing."""
-        limits = {"least_px": self.config.least_px, "most_px": self.config.most_px}
-        return RoboDopamineCollator(self.config, tokenizer, BoundedImages(patch_px, normalisation, **limits))

@@ -42,8 +42,8 @@ PROGRESS_TOKEN = "<|prog_token|>"
 # In the order in which the tokenizer gets them.
 SPECIAL_TOKENS = (SPLIT_TOKEN, REWARD_TOKEN, PREFERENCE_TOKEN, SIMILARITY_TOKEN, PROGRESS_TOKEN)
 OLD_RUN_REMEDY = (
-    "a run of before 2026-01-21 had 8 special tokens, resized images and no frame_pool_attn: score it with the upstream "
-    "commit that trained it, or train it anew"
+    "a run of before 2026-01-21 had 8 special tokens, resized images and no frame_pool_attn: score it with the "
+    "upstream commit that trained it, or train it anew"
 )
 _PROGRESS_SCALE = (
     "how far along the robot is towards completing the task, a float between 0 and 1, where 0 is the starting state "

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,10 +13,9 @@ from rfm.engine.execution import Execution
 from rfm.engine.layers import Normalisation, progress_from_logits
 from rfm.engine.predictor import RowScores, no_success
 from rfm.families.roboreward.prompts import SCORES, RoboRewardCollator, RoboRewardConfig, is_unclear, parsed
-from rfm.files import CheckpointError
 from rfm.qwen.batch import VlmBatch, VlmRow
 from rfm.qwen.images import QwenImages
-from rfm.qwen.language import LanguageCheckpoint, LanguageNetwork
+from rfm.qwen.language import LanguageCheckpoint
 from rfm.qwen.written import WritingPredictor, WrittenAnswer, unread
 from rfm_client.contract import FrameScores, RewardError
 from rfm_client.contract.description import Description
@@ -80,28 +78,20 @@ class RoboRewardCheckpoint(LanguageCheckpoint):
 
     made_of = RoboRewardConfig
     predictor_of = RoboRewardPredictor
+    collator_of = RoboRewardCollator
 
     @property
     def description(self) -> Description:
         """The model's inputs and outputs."""
-        return Description(
-            kind="RoboReward, expected value of the score" if self.config.is_expected else "RoboReward",
-            network={"class": LanguageNetwork.__name__},
+        return self.described(
+            "RoboReward, expected value of the score" if self.config.is_expected else "RoboReward",
             progress_bins=len(SCORES),
             more_scores=() if self.config.is_expected else ("unclear",),
             scores_whole_prefixes=True,
             may_not_answer=not self.config.is_expected,
-            asks_in_words=True,
-            keeps_features=True,
             uses_graphs=self.config.is_expected,  # a written answer keeps keys and values, whose number grows
-            is_large=True,
         )
 
-    def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> RoboRewardCollator:
-        """Return the collator with this tokenizer and preprocessing. Raises CheckpointError."""
-        images = QwenImages(patch_px, normalisation, max_video_side_px=None)
-        collator = RoboRewardCollator(self.config, tokenizer, images)
-        for score, token in zip(SCORES, collator.digits, strict=True):
-            if tokenizer.decode([token]) != str(score):
-                raise CheckpointError.at(f"base model {self.processor}", f"a token for {score}", "none")
-        return collator
+    def images(self, patch_px: int, normalisation: Normalisation) -> QwenImages:
+        """Return the preprocessing of videos, which keeps large frames large."""
+        return QwenImages(patch_px, normalisation, max_video_side_px=None)

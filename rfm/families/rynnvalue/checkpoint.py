@@ -11,12 +11,10 @@ import numpy as np
 import torch
 
 from rfm.engine.execution import Execution
-from rfm.engine.layers import Normalisation
 from rfm.engine.predictor import RowScores, no_success
 from rfm.families.rynnvalue.network import RynnConfig, RynnNetwork, RynnOutput, entropy
 from rfm.families.rynnvalue.prompts import RELATIVE_TOKEN, VALUE_TOKEN, RynnCollator
 from rfm.qwen.batch import VlmRow
-from rfm.qwen.images import BoundedImages
 from rfm.qwen.language import LanguageCheckpoint
 from rfm.qwen.predictor import QwenPredictor
 from rfm_client.contract import FrameScores, RewardError
@@ -85,33 +83,23 @@ class RynnCheckpoint(LanguageCheckpoint):
     made_of = RynnConfig
     network_of = RynnNetwork
     predictor_of = RynnPredictor
+    collator_of = RynnCollator
     has_language_head: ClassVar[bool] = False
     reads_videos: ClassVar[bool] = False
 
     @property
     def description(self) -> Description:
         """The model's inputs and outputs."""
-        return Description(
-            kind="RynnValue",
-            network={"class": RynnNetwork.__name__},
+        return self.described(
+            "RynnValue",
             trained_frames=TRAINED_FRAMES,
             trained_padding=False,
             has_progress=False,
             more_scores=("remaining_s", "relative_s", "entropy"),
-            asks_in_words=True,
-            keeps_features=True,
             uses_graphs=self.config.attention == "causal",  # otherwise the groups need a mask
-            is_large=True,
         )
 
     @property
     def own_tokens(self) -> dict[str, int]:
         """The value tokens and their ids."""
         return {VALUE_TOKEN: self.config.value_token, RELATIVE_TOKEN: self.config.relative_token}
-
-    def make_collator(  # type: ignore[override]  # the prompts of the others have one video
-        self, tokenizer: Any, patch_px: int, normalisation: Normalisation
-    ) -> RynnCollator:
-        """Return the collator with this tokenizer and preprocessing."""
-        limits = {"least_px": self.config.least_px, "most_px": self.config.most_px}
-        return RynnCollator(self.config, tokenizer, BoundedImages(patch_px, normalisation, **limits))

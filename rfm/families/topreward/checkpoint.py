@@ -18,8 +18,8 @@ from rfm.engine.layers import Normalisation
 from rfm.engine.predictor import RowScores, no_success
 from rfm.families.topreward.prompts import TopRewardCollator, TopRewardConfig, TopRewardImages
 from rfm.qwen.batch import VlmBatch, VlmRow
-from rfm.qwen.images import FRAMES_PER_GROUP
-from rfm.qwen.language import LanguageCheckpoint, LanguageNetwork
+from rfm.qwen.images import FRAMES_PER_GROUP, QwenImages
+from rfm.qwen.language import LanguageCheckpoint
 from rfm.qwen.predictor import QwenPredictor
 from rfm_client.contract import FrameScores, RewardError, Sample
 from rfm_client.contract.description import Description
@@ -77,22 +77,18 @@ class TopRewardCheckpoint(LanguageCheckpoint):
 
     made_of = TopRewardConfig
     predictor_of = TopRewardPredictor
+    collator_of = TopRewardCollator
 
     @property
     def description(self) -> Description:
         """The model's inputs and outputs."""
-        return Description(
-            kind=f"TOPReward, as {'LeRobot' if self.config.variant == 'lerobot' else 'Robometer'} computes it",
-            network={"class": LanguageNetwork.__name__},
+        return self.described(
+            f"TOPReward, as {'LeRobot' if self.config.variant == 'lerobot' else 'Robometer'} computes it",
             network_frames=self.config.max_frames,
             more_scores=("log_prob",),
             needs_whole_episode=True,
-            asks_in_words=True,
-            keeps_features=True,
-            is_large=True,
         )
 
-    def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> TopRewardCollator:
-        """Return the collator with this tokenizer and preprocessing."""
-        images = TopRewardImages(patch_px, normalisation, config=self.config)
-        return TopRewardCollator(self.config, tokenizer, images)
+    def images(self, patch_px: int, normalisation: Normalisation) -> QwenImages:
+        """Return the preprocessing of videos, as this variant has it."""
+        return TopRewardImages(patch_px, normalisation, config=self.config)
