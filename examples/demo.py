@@ -18,9 +18,10 @@ from rfm.serve.triton_server import stopped_by_signals, temporary_server
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, SimilaritySample, Trajectory
 from rfm_client.cli.pictures import Panel, plot
 from rfm_client.cli.scoring import checkpoint_of, heading
-from rfm_client.cli.show import PAGE_PORT, PAGE_URL, command, next_steps, scores_table, steps_with_server
+from rfm_client.cli.show import next_steps, scores_table, steps_with_server
 from rfm_client.contract.wire import DEFAULT_MODEL
 from rfm_client.frames.inputs import load_trajectory
+from rfm_commands.try_video import steps_without_server
 from toy_world import Clip, Task, make_clip
 from toy_world.video import FPS, write_video
 
@@ -67,11 +68,7 @@ def demo(
     else:
         with stopped_by_signals(), temporary_server(repository, output / "tritonserver.log") as endpoints:
             show_clips(endpoints.grpc_url, trajectories, output / "rewards.png")
-        serve = command("rfm", "serve", _short(repository), "--gateway-port", PAGE_PORT)
-        score = command("rfm-client", "score", output / "success.mp4", "--task", TASK.sentence())
-        steps = next_steps(
-            (f"serve the model, and the page at {PAGE_URL}", serve), ("in another terminal, score the video", score)
-        )
+        steps = next_steps(*steps_without_server(_short(repository), output / "success.mp4", TASK.sentence()))
     typer.echo(f"The curves are in {output / 'rewards.png'}, the clips in {output}/*.mp4.\n{steps}")
 
 

@@ -8,7 +8,6 @@ import logging
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -40,7 +39,8 @@ from rfm_commands.command import AdminKeyFile, RfmCommand, RfmCommands, TritonPa
 from rfm_commands.config import Config, GatewayBeside, named_as_typed
 from rfm_commands.models import app as models_app
 from rfm_commands.rollout import names_of
-from rfm_commands.serve_screen import ServeScreen, log_file
+from rfm_commands.serve_screen import ServeScreen, log_file, opened
+from rfm_commands.try_video import try_video
 
 ACCEPTED_WARNING = "a Triton with known remote vulnerabilities is accepted: use NVIDIA's container 26.07 or newer"
 
@@ -184,9 +184,7 @@ def serve(
         logger.warning("%s is no loopback address, and %s", config.serve.host, ACCEPTED_WARNING)
     endpoints = Endpoints.of(config.serve, config.gateway.port)
     log = log_file(triton_log, endpoints.http_port, os.environ)
-    if log is not None:
-        log.parent.mkdir(parents=True, exist_ok=True)
-    with nullcontext() if log is None else log.open("ab") as lines:
+    with opened(log) as lines:
         server = TritonServer(
             folder,
             endpoints,
@@ -221,6 +219,7 @@ try:
     app.command(cls=RfmCommand)(label)
 except ModuleNotFoundError as error:
     add_missing(app, "label", f"{error.name} is not installed", "labels", "rfm")
+app.command("try", cls=RfmCommand)(try_video)
 app.add_typer(models_app, name="models")
 
 

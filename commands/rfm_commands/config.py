@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -114,11 +115,10 @@ def _entries(content: Any) -> Iterator[tuple[str, str, Any]]:
         elif key in SECTIONS:
             for inner, each in _items(value, key):
                 if inner not in SECTIONS[key].settings():
-                    known = ", ".join(f"{key}.{name}" for name in SECTIONS[key].settings())
-                    raise ConfigError.at(f"{key}.{inner!s:.100}", f"one of {known}", "an unknown key")
+                    raise _unknown(f"{key}.{inner!s:.100}", (f"{key}.{name}" for name in SECTIONS[key].settings()))
                 yield f"{key}.{inner}", f"{key}.{inner}", each
         else:
-            raise ConfigError.at(f"{key!s:.100}", f"one of {', '.join((*SECTIONS, *FASTAPI_KEYS))}", "an unknown key")
+            raise _unknown(f"{key!s:.100}", (*SECTIONS, *FASTAPI_KEYS))
 
 
 def _address(url: Any) -> Any:
@@ -146,3 +146,13 @@ def _items(content: Any, where: str) -> Iterable[tuple[Any, Any]]:
     if not isinstance(content, dict):
         raise ConfigError.at(where, "keys and values", type(content).__name__)
     return content.items()
+
+
+def _unknown(name: str, known: Iterable[str]) -> ConfigError:
+    """Return the error for an unknown key, with the most similar key from any section."""
+    names = [*FASTAPI_KEYS, *(f"{section}.{key}" for section, kind in SECTIONS.items() for key in kind.settings())]
+    keys = [each.rpartition(".")[2] for each in names]
+    close = get_close_matches(name.rpartition(".")[2], keys, 1, cutoff=0.75)
+    near = [each for each, key in zip(names, keys, strict=True) if [key] == close]
+    meant = f"; perhaps {' or '.join(near)}" if near else ""
+    return ConfigError.at(name, f"one of {', '.join(known)}", f"an unknown key{meant}")

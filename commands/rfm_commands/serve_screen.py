@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import IO
+
+from google.protobuf.text_format import ParseError
 
 from rfm.serve.access import Endpoints
 from rfm.serve.repository import models_in
@@ -19,6 +23,7 @@ from rfm_client.cli.show import PAGE_PORT, PAGE_URL, command, next_steps, score_
 from rfm_client.contract.addresses import from_here
 from rfm_client.contract.wire import frames_name
 from rfm_commands.rollout import names_of
+from rfm_export.publish import read_config
 from rfm_gateway import GatewayConfig
 
 LOG_FOLDER = Path(".local", "state", "rfm")  # in the home folder, as the XDG base directory specification says
@@ -33,6 +38,17 @@ def log_file(named: Path | None, http_port: int, environment: Mapping[str, str])
         return named
     folder = environment.get("XDG_STATE_HOME")
     return (Path(folder, "rfm") if folder else Path.home() / LOG_FOLDER) / f"triton-{http_port}.log"
+
+
+@contextmanager
+def opened(log: Path | None) -> Iterator[IO[bytes] | None]:
+    """Context manager with the file, opened for appending. Raises OSError."""
+    if log is None:
+        yield None
+        return
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("ab") as file:
+        yield file
 
 
 @dataclass
@@ -55,9 +71,9 @@ class ServeScreen:
             self._show(f"loading {', '.join(models)} from {self.repository} ...")
 
     def show_ready(self) -> None:
-        """Show the addresses and models, and what to try next."""
+        """Show the addresses, models and device, and what to try next."""
         rows = {
-            "models": ", ".join(models_in(self.repository)),
+            "models": f"{self._models()}, on {self._devices()}",
             "gRPC": self.endpoints.grpc_url,
             "HTTP": self.endpoints.http_url,
             "metrics": self.endpoints.metrics_url,
@@ -70,6 +86,27 @@ class ServeScreen:
 
     def _show(self, *lines: str) -> None:
         print("\n".join(["rfm serve: " + lines[0], *lines[1:]]), file=sys.stderr, flush=True)
+
+    def _models(self) -> str:
+        """Return each model with the versions that its file names."""
+        shown = []
+        for model in models_in(self.repository):
+            try:
+                versions = read_config(self.repository, model).version_policy.specific.versions
+            except (OSError, ParseError):  # another program's; Triton has read it
+                versions = []
+            shown.append(" ".join([model, *map(str, versions)]))
+        return ", ".join(shown)
+
+    def _devices(self) -> str:
+        """Return the GPUs that all models use, or the CPU."""
+        gpus: set[int] = set()
+        for model in models_in(self.repository):
+            try:
+                gpus.update(gpu for group in read_config(self.repository, model).instance_group for gpu in group.gpus)
+            except (OSError, ParseError):
+                continue
+        return f"GPU {', '.join(map(str, sorted(gpus)))}" if gpus else "the CPU"
 
     def _gateway_row(self) -> dict[str, str]:
         if self.gateway is None:

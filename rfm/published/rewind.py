@@ -6,7 +6,8 @@ Where configuration and weights disagree, the weights decide.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from rfm.config import CheckpointConfig
 from rfm.families.rewind.checkpoint import MODEL_TYPE, RewindCheckpoint
 from rfm.families.rewind.encoders import Encoders
 from rfm.families.rewind.network import RewindConfig
+from rfm.families.rewind.pretrained import IMAGE_MODELS, TEXT_MODELS, load_config, load_preprocessor
 from rfm.files import (
     NETWORK_CONFIG,
     RUN_CONFIG,
@@ -34,9 +36,21 @@ from rfm.published.run_config import MAX_COUNT, check_progress, find_run_config,
 from rfm.published.weights import has_head, read_weights, take_prefix
 from rfm_client.contract.checks import require
 
-# Upstream's encoders, whose embeddings ReWiND checkpoints are trained on.
+# Upstream's encoders, whose embeddings ReWiND checkpoints are trained on, and the settings in their files.
 IMAGE_ENCODER = "facebook/dinov2-base"
 TEXT_ENCODER = "sentence-transformers/all-MiniLM-L12-v2"
+_SHAPE = {"num_hidden_layers": 12, "num_attention_heads": 12}
+_IMAGE_SETTINGS: dict[str, Any] = {
+    "model_type": "dinov2",
+    "hidden_size": 768,
+    "patch_size": 14,
+    **_SHAPE,
+    "resize_px": 256,
+    "crop_px": (224, 224),
+    "mean": (0.485, 0.456, 0.406),
+    "std": (0.229, 0.224, 0.225),
+}
+_TEXT_SETTINGS: dict[str, Any] = {"model_type": "bert", "hidden_size": 384, "vocab_size": 30522, **_SHAPE}
 IMAGE_ENCODER_PREFIX = "image_encoder."
 TEXT_ENCODER_PREFIX = "text_encoder."
 # Upstream's configurations from before causal_mask state all these fields; no network had a causal mask then.
@@ -70,24 +84,59 @@ def _loaded(
         given = f"--{kind}-encoder" if option else UPSTREAM_DEFAULT
         whose = "weights of the checkpoint" if weights else "only its width agrees"
         of_encoders.append(Assumption(f"{kind}_encoder", source_name(source), f"{given}; {whose}"))
-    return Loaded(checkpoint, (*assumed, *of_encoders), encoders=partial(_encoders, checkpoint, sources))
+    notes, load = partial(_encoder_notes, sources), partial(_encoders, checkpoint, sources)
+    return Loaded(checkpoint, (*assumed, *of_encoders), notes, load)
+
+
+def _encoder_notes(sources: tuple[str, str]) -> list[str]:
+    """Return one line per encoder that differs from upstream's with the same width. Raises CheckpointError."""
+    with _having_encoders(sources):
+        found = image_differences(sources[0]), text_differences(sources[1])
+    return [
+        f"{source}: differs from upstream's {known} in {'; '.join(lines)}: scores are right only if the run's "
+        "embeddings were made with it"
+        for known, source, lines in zip((IMAGE_ENCODER, TEXT_ENCODER), sources, found, strict=True)
+        if lines
+    ]
+
+
+def image_differences(source: str) -> list[str]:
+    """Return the differences between upstream's image encoder and another with its width, by their files."""
+    return _differences(_IMAGE_SETTINGS, load_config(source, IMAGE_MODELS), load_preprocessor(source))
+
+
+def text_differences(source: str) -> list[str]:
+    """Return the differences between upstream's text encoder and another with its width, by their files."""
+    return _differences(_TEXT_SETTINGS, load_config(source, TEXT_MODELS))
+
+
+def _differences(known: Mapping[str, Any], *files: Any) -> list[str]:
+    got = {name: next((getattr(file, name) for file in files if hasattr(file, name)), None) for name in known}
+    if got["hidden_size"] != known["hidden_size"]:
+        return []  # another encoder, as the weights' shapes tell
+    return [f"{name}: expected {known[name]}, got {got[name]}" for name in known if got[name] != known[name]]
 
 
 def _encoders(checkpoint: RewindCheckpoint, sources: tuple[str, str]) -> Encoders:
     """Load a checkpoint's encoders. Raises CheckpointError if they are missing or do not fit the network."""
-    names = " and ".join(sources)
-    try:
+    with _having_encoders(sources):
         encoders = Encoders.from_pretrained(
             *sources, image_weights=checkpoint.image_encoder or None, text_weights=checkpoint.text_encoder or None
         )
+    widths, expected = (encoders.video_feature_dim, encoders.text_feature_dim), checkpoint.description.widths
+    require(f"encoders {' and '.join(sources)}", widths == expected, f"widths {expected}", widths, CheckpointError)
+    return encoders
+
+
+@contextmanager
+def _having_encoders(sources: tuple[str, str]) -> Iterator[None]:
+    try:
+        yield
     except misfits(ImportError, OSError) as error:
         absent = [source for source in sources if not Path(source).is_dir()]
         here = f"; there is no folder {' nor '.join(absent)} either" if absent else ""
         hint = f"name local folders with --image-encoder and --text-encoder{here}"
-        raise CheckpointError(f"encoders {names}: {cut(str(error))} ({hint})") from error
-    widths, expected = (encoders.video_feature_dim, encoders.text_feature_dim), checkpoint.description.widths
-    require(f"encoders {names}", widths == expected, f"widths {expected}", widths, CheckpointError)
-    return encoders
+        raise CheckpointError(f"encoders {' and '.join(sources)}: {cut(str(error))} ({hint})") from error
 
 
 def reads(folder: Path) -> bool:

@@ -6,6 +6,7 @@ Every format has a rename table, which maps weight names to VlmRewardModel's.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -79,7 +80,20 @@ def load(folder: Path, options: CheckpointConfig) -> Loaded:
     has_processor = options.base_model is None and isinstance(processor, Path)
     checkpoint = VlmCheckpoint(config, weights, options.base_model or processor, factors)
     checkpoint.check()
+    if options.base_model is not None and re.fullmatch(_PUBLISHED_NAMES[config.family], config.base_model_id):
+        _check_published(checkpoint.collator, options.base_model)
     return Loaded(checkpoint, assumptions, lambda: _notes(checkpoint, has_processor=has_processor))
+
+
+def _check_published(collator: VlmCollator, processor: str) -> None:
+    """Raise CheckpointError if a processor that replaces the published one differs from it."""
+    if found := _differences(collator):
+        named = collator.config.base_model_id
+        raise CheckpointError(
+            f"base model {processor}: expected a processor like that of {named}, which the run names: "
+            f"{'; '.join(found)}; name a folder with the files of {named} with --base-model, or correct "
+            "model.base_model_id of the run's config.yaml"
+        )
 
 
 def _notes(checkpoint: VlmCheckpoint, *, has_processor: bool) -> list[str]:
@@ -202,6 +216,7 @@ def _used(tensors: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, T
 
 
 # The published processors by backbone family, with which another is compared.
+_PUBLISHED_NAMES = {QWEN_2_5: r"Qwen/Qwen2\.5-VL-\w+-Instruct", QWEN3: r"Qwen/Qwen3-VL-\w+-Instruct"}
 _QWEN_PROMPT = "<|im_start|>user\nTASK{visual} 1: <|vision_start|><|{pad}_pad|><|vision_end|><|im_end|>\n"
 _FACTS: dict[str, dict[str, Any]] = {
     QWEN_2_5: {

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -157,12 +158,17 @@ CONTRADICTIONS: dict[str, tuple[str, str, object, str]] = {
 
 
 @pytest.mark.parametrize(("file", "key", "value", "expected"), CONTRADICTIONS.values(), ids=CONTRADICTIONS)
-def test_a_processor_unlike_the_published_one_is_noted(
+def test_a_processor_unlike_the_published_one_is_refused_or_noted_if_the_run_names_it(
     vlm: Copy, file: str, key: str, value: Any, expected: str
 ) -> None:
     folder, base = vlm(PLAIN)
     rewritten(base / file, lambda content: content.update({key: value}))
-    (line,) = notes(folder, base)
+    message = f"base model {base}: expected a processor like that of Qwen/{OF_QWEN_3}, which the run names: {expected}"
+    with pytest.raises(CheckpointError, match=f"^{re.escape(message)}") as refused:
+        notes(folder, base)
+    assert f"; name a folder with the files of Qwen/{OF_QWEN_3} with --base-model, or " in str(refused.value)
+    rewritten(folder / "config.yaml", lambda run: run["model"].update(base_model_id=str(base)))
+    (line,) = notes(folder)
     assert line.startswith(f"base model {base}: differs from the published processors of qwen3_vl in {expected}")
 
 

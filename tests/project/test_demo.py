@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The demo's checkpoint, and the training. CI runs ``make demo`` itself."""
+"""The demo's checkpoint, ``rfm try``, and the training. CI runs ``make demo`` itself."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
+import clip
 import rfm_export
 from commands import nothing_left_behind
+from in_process import rfm
 from paths import ROOT
 from rfm import published
 from rfm.config import ExportConfig
@@ -74,6 +76,40 @@ def test_the_demo_s_checkpoint_separates_right_from_wrong_on_unseen_clips() -> N
 def _scored(outcome: Outcome) -> float:
     assert not isinstance(outcome, Exception), outcome
     return outcome.last_progress if isinstance(outcome, ProgressResult) else outcome.preference  # type: ignore[union-attr]
+
+
+@pytest.mark.nightly
+@pytest.mark.triton
+def test_a_checkpoint_of_one_s_own_scores_a_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
+    clip.write(tmp_path / "clip.mp4")
+    encoders = REPOSITORY / "rfm_encoder" / "1"
+    checkpoint = REPOSITORY / "rfm" / "1" / "checkpoint"
+    options = {
+        "--task": clip.TASK,
+        "--fps": 10,
+        "--output": tmp_path,
+        "--checkpoint": checkpoint,
+        "--image-encoder": encoders / "image_encoder",
+        "--text-encoder": encoders / "text_encoder",
+    }
+    with nothing_left_behind():
+        result = rfm("try", tmp_path / "clip.mp4", *(word for pair in options.items() for word in pair))
+    assert result.exit_code == 0, result.output
+    exported = f"rfm export --checkpoint {checkpoint} --image-encoder {encoders / 'image_encoder'}"
+    for shown in (clip.TASK, "clip.mp4", "32 frames", exported, "rfm serve my_models --gateway-port 8100"):
+        assert shown in result.output
+    assert (tmp_path / "rewards.png").read_bytes().startswith(PNG)
+
+
+def test_rfm_try_refuses_a_repository_whose_path_has_spaces(tmp_path: Path) -> None:
+    clip.write(tmp_path / "clip.mp4")
+    spaced = tmp_path / "my models"
+    spaced.symlink_to(REPOSITORY)
+    result = rfm("try", tmp_path / "clip.mp4", "--task", "x", "--repository", spaced, "--output", tmp_path)
+    assert result.exit_code == 1
+    expected = "a path without spaces, such as a link (ln -s)"
+    assert result.stderr.startswith(f"rfm: repository: expected {expected}, got {spaced}")
 
 
 @pytest.mark.nightly

@@ -74,6 +74,7 @@ DEFAULTS = {
     "rfm gateway": ["Port to listen on. [1 to 65535; default: 8000]", "default: --viewer"],
     "rfm serve": ["--gateway-viewer / --gateway-no-viewer", "default: --gateway-viewer", "default: 127.0.0.1"],
     "rfm export": ["[0 to 4096; default: 0]", "[at least 0; default: 256]"],
+    "rfm try": ["[default: model_repository]", "[default: demo_output]"],
 }
 
 

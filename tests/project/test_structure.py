@@ -88,7 +88,7 @@ EXCEPTIONS = {
     "commands/rfm_commands/cli.py": {"rfm_export"},  # the command, where all packages meet
     "examples/demo_training/losses.py": {"rfm"},  # trains the served network
     "examples/demo_training/networks.py": {"rfm"},
-    "examples/demo.py": {"rfm"},  # starts the server
+    "examples/demo.py": {"rfm", "rfm_commands"},  # starts the server
     "examples/train_policy.py": {"rfm"},
     "benchmarks/bench.py": {"rfm"},  # starts servers
     "benchmarks/contestants.py": {"rfm", "rfm_commands", "rfm_export"},

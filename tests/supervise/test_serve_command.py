@@ -23,7 +23,7 @@ import clip
 import rfm_export
 import stand_in_triton
 from client_commands import Terminal
-from commands import EXIT_S, REPOSITORY, command, is_alive, nothing_left_behind
+from commands import EXIT_S, REPOSITORY, RFM, command, is_alive, nothing_left_behind
 from gateways import answers
 from in_process import rfm
 from paths import ROOT
@@ -37,6 +37,7 @@ from rfm_client.contract.process import MOST_FILES
 from servers import PATIENCE_S, Serving, children, model_processes, wait_for
 
 VIDEO = ROOT / "tests/videos/jaco_play_pick_up_green_cup.mp4"
+TRY = ["try", str(VIDEO), f"--repository={REPOSITORY}", f"--task={clip.TASK}"]
 
 
 def executable(file: Path, content: str) -> Path:
@@ -117,7 +118,7 @@ def test_a_terminal_shows_one_screen_and_a_file_the_lines_of_triton(
     shown = terminal.shown.splitlines()
     assert shown[0] == f"rfm serve: loading rfm, rfm_encoder, rfm_frames from {repository} ..."
     for line in (
-        "  models   rfm, rfm_encoder, rfm_frames",
+        "  models   rfm 1, rfm_encoder 1, rfm_frames 1, on the CPU",
         f"  gRPC     {endpoints.grpc_url}",
         f"  page     http://127.0.0.1:{gateway}/",
         f"  log      {log} (lines of Triton and the models)",
@@ -128,8 +129,12 @@ def test_a_terminal_shows_one_screen_and_a_file_the_lines_of_triton(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL], ids=["hang up", "kill"])
-def test_a_signal_leaves_nothing_running(tmp_path: Path, number: signal.Signals) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "number"),
+    [([], signal.SIGHUP), ([], signal.SIGKILL), (TRY, signal.SIGTERM)],
+    ids=["hang up", "kill", "try"],
+)
+def test_a_signal_leaves_nothing_running(tmp_path: Path, arguments: list[str], number: signal.Signals) -> None:
     """A stand-in never gets ready, so the moment of the signal is certain."""
     started = tmp_path / "started"
     program = executable(
@@ -137,8 +142,9 @@ def test_a_signal_leaves_nothing_running(tmp_path: Path, number: signal.Signals)
     )
     temporary = tmp_path / "tmp"
     temporary.mkdir()
+    words = [RFM, *arguments] if arguments else command(REPOSITORY, Endpoints.free())
     process = subprocess.Popen(
-        [*command(REPOSITORY, Endpoints.free()), "--tritonserver", program],
+        [*words, "--tritonserver", program],
         cwd=tmp_path,
         env={**os.environ, "TMPDIR": str(temporary)},
         stdout=subprocess.DEVNULL,

@@ -173,7 +173,7 @@ class Commands(CommandGroup):
     """The ``rfm-client`` commands. Names the right program if a command belongs to the other one."""
 
     other_program = "rfm"
-    others: Collection[str] = ("export", "serve", "models")
+    others: Collection[str] = ("export", "serve", "try", "models")
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command. Raises a usage error with the right name, or the program that has the command."""

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: MIT
+"""``rfm try``: a video's scores from a temporary server, as a table and a plot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+
+import typer
+
+from rfm.config import CheckpointConfig, ExportConfig
+from rfm.serve.access import Endpoints
+from rfm.serve.triton_server import stopped_by_signals, temporary_server
+from rfm_client import RewardClient, Trajectory
+from rfm_client.cli.command import OptionValues, with_options
+from rfm_client.cli.options import FrameRate
+from rfm_client.cli.show import PAGE_PORT, PAGE_URL, command, next_steps, scores_table
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.contract.wire import frames_name
+from rfm_commands.command import TritonPath, fail
+
+REPOSITORY = Path("model_repository")
+EXPORTED = Path("my_models")  # where the user could export the checkpoint
+
+
+@with_options
+def try_video(
+    video: Annotated[Path, typer.Argument(metavar="VIDEO", help="Video file to score.")],
+    task: Annotated[str, typer.Option(help="The task, as a sentence.")],
+    rate: FrameRate,
+    given: OptionValues[CheckpointConfig],
+    repository: Annotated[Path, typer.Option(help="Repository to serve, if no checkpoint is given.")] = REPOSITORY,
+    output: Annotated[Path, typer.Option(help="Folder for the plot and Triton's log.")] = Path("demo_output"),
+    tritonserver: TritonPath = None,
+) -> None:
+    """Serve a checkpoint, score one video, plot, and stop.
+
+    Example: rfm try video.mp4 --task "open the drawer" --checkpoint org/name
+    """
+    try:
+        import av  # noqa: F401  ``read_video`` needs it
+
+        from rfm_client.frames.video import read_video
+    except ImportError as error:
+        fail(f'it needs {error.name}: pip install ".[demo,encoders,triton]"')
+    settings = ExportConfig(**given)
+    with stopped_by_signals(), TemporaryDirectory(prefix="rfm-try-") as folder:
+        frames = read_video(video, rate.fps)
+        try:
+            output.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            fail(f"{output}: expected a folder that can be made, got: {error.strerror}; --output names another one")
+        served = repository
+        if settings.checkpoint is not None:
+            served = _exported_frames(settings.checkpoint, settings, Path(folder) / "model_repository")
+        with temporary_server(served, output / "tritonserver.log", tritonserver) as endpoints:
+            score_video(endpoints, video, frames, task, output / "rewards.png")
+    steps = []
+    if settings.checkpoint is not None:
+        repository = EXPORTED
+        exported = command("rfm", "export", *_words(given), "--repository", repository)
+        steps.append(("export the checkpoint", exported))
+    typer.echo(next_steps(*steps, *steps_without_server(repository, video, task)))
+
+
+def steps_without_server(repository: Path, video: Path, task: str) -> list[tuple[str, str]]:
+    """Return what to try with a repository and a video: serve it with the page, score the video."""
+    served = command("rfm", "serve", repository, "--gateway-port", PAGE_PORT)
+    score = command("rfm-client", "score", video, "--task", task)
+    return [(f"serve the model, and the page at {PAGE_URL}", served), ("in another terminal, score the video", score)]
+
+
+def score_video(endpoints: Endpoints, video: Path, frames: UInt8Array, task: str, picture: Path) -> None:
+    """Score the video, print the table, and draw the plot.
+
+    frames: uint8 [T, H, W, 3], T frames, H x W pixels, evenly thinned if the checkpoint takes fewer
+    """
+    from rfm_client.cli.pictures import Panel, plot
+    from rfm_client.cli.scoring import checkpoint_of, heading
+    from rfm_client.frames.video import frame_times_s
+
+    with RewardClient(endpoints.grpc_url) as client:
+        trajectory = Trajectory(frames=frames, task=task)
+        result = client.progress(trajectory, subsample=True)
+        title = heading(task, [checkpoint_of(client, trajectory)])
+    if len(result.progress) < len(frames):
+        typer.echo(f"{video.name}: {len(result.progress)} of {len(frames)} frames, evenly, are scored")
+    print(scores_table(f'"{task}"', [(video.name, result)]))
+    plot(picture, [Panel.of(video.name, result, frames, frame_times_s(video, len(frames)))], title)
+    typer.echo(f"The curves are in {picture}.")
+
+
+def _exported_frames(checkpoint: str, settings: ExportConfig, repository: Path) -> Path:
+    """Export the checkpoint and return the repository. Fails if the checkpoint scores only embeddings."""
+    import rfm_export
+
+    rfm_export.export(checkpoint, repository, settings)
+    if not (repository / frames_name(settings.name)).exists():
+        fail(f"{checkpoint}: expected one that scores frames, got none; name --image-encoder, --text-encoder")
+    return repository
+
+
+def _words(given: OptionValues[Any]) -> list[str]:
+    """Return a checkpoint's options, as they stand on a command line."""
+    words = []
+    for name, value in given.items():
+        option = CheckpointConfig.settings()[name].option
+        words += [option] if value is True else [option, str(value)]
+    return words
