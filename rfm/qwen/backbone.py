@@ -373,13 +373,6 @@ def run_layers(language: Any, *parts: Part) -> Tensor:
     return language.norm(concatenated([part.states.flatten(0, 1) for part in parts]))
 
 
-def last_hidden_state(
-    language: Any, inputs: dict[str, Tensor], features: Tensor, key_values: KeyValues | None = None
-) -> Tensor:
-    """Return the hidden states behind the final norm, [B, L, D]. ``Part`` describes the parameters."""
-    return run_layers(language, Part(language, inputs, features, key_values)).unflatten(0, inputs["input_ids"].shape)
-
-
 def next_hidden_state(
     language: Any, tokens: Indices, position_ids: Indices, lengths: Indices, key_values: KeyValues
 ) -> Tensor:

@@ -103,7 +103,7 @@ class LanguageNetwork(nn.Module):
         key_values: receives the keys and values of all tokens
         """
         hidden, made = qwen_states(self.model, batch, key_values, self.graphs)
-        return LanguageOutput(self.lm_head(hidden[batch.query_rows, batch.query_tokens]), made)
+        return LanguageOutput(self.lm_head(hidden[batch.queries]), made)
 
 
 class LanguageCollator(QwenCollator):

@@ -95,7 +95,7 @@ class QwenPredictor:
         """Count tokens, without and with padding, encoded frames, and frames with cached features."""
         execution.add_tokens(batch.num_tokens, batch.num_slots)
         execution.num_encoded += 0 if batch.pixels is None else batch.pixels.num_shown
-        execution.num_found += 0 if batch.layout is None else len(batch.layout.kept) * self.collator.frames_per_shot
+        execution.num_found += len(batch.layout.kept) * self.collator.frames_per_shot
         execution.cache_bytes = None if self.cache is None else self.cache.num_bytes
 
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
@@ -108,7 +108,7 @@ class QwenPredictor:
 
     def _output(self, batch: VlmBatch, *arguments: Any) -> Any:
         """Return the network's output. Out of memory, free caches and graphs: the engine retries with fewer rows."""
-        self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
+        self._copies.wait_for([video for videos in batch.pixels.videos for video in videos] if batch.pixels else [])
         try:
             with memory_errors():
                 return self.network(batch.to(self.device, self._dtype), *arguments)
@@ -119,12 +119,9 @@ class QwenPredictor:
                 self.network.graphs.clear()
             raise
 
-    def _keep(self, rows: Sequence[VlmRow], layout: Layout | None, made: torch.Tensor | None) -> None:
-        """Cache the videos' frames and new features; skip videos larger than the cache.
-
-        layout: where the shots' tokens lie; None: nothing can be cached
-        """
-        if self.cache is None or layout is None:
+    def _keep(self, rows: Sequence[VlmRow], layout: Layout, made: torch.Tensor | None) -> None:
+        """Cache the videos' frames and new features; skip videos larger than the cache."""
+        if self.cache is None:
             return
         with suppress(torch.OutOfMemoryError), memory_errors():  # the scores are complete without the cache
             self._keep_all(self.cache, rows, layout, made)
