@@ -12,7 +12,6 @@ import numpy.typing as npt
 from torch import Tensor
 
 from rfm.engine.execution import Execution
-from rfm.engine.graphs import Graphs
 from rfm.engine.layers import progress_from_logits
 from rfm_client.contract import (
     FrameScores,
@@ -79,13 +78,6 @@ class Predictor(Protocol[Row, Batch]):
 
     def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
         """Return frame scores for a progress sample, from all row scores."""
-
-
-class GraphedPredictor(Predictor[Row, Batch], Protocol):
-    """A predictor that can score small batches with CUDA graphs: ``Description.uses_graphs``."""
-
-    def use_graphs(self, graphs: Graphs) -> None:
-        """Score small batches with these graphs from now on."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from rfm.engine.family import Checkpoint, FrameEncoders
 from rfm.engine.feature_cache import BYTES_PER_MIB, FeatureCache
 from rfm.engine.graphs import CudaCapture, Graphs
 from rfm.engine.layers import keep_float32
-from rfm.engine.predictor import GraphedPredictor, Predictor, RowScores, of_prefixes
+from rfm.engine.predictor import Predictor, RowScores, of_prefixes
 from rfm_client.contract import (
     FRAME_SCORES,
     BatchTiming,
@@ -63,7 +63,7 @@ class Engine:
     token_budget: maximum tokens, with padding, in a forward pass over several rows; a larger row runs alone
     max_sample_tokens: maximum tokens in one sequence; longer samples are refused
     cache: the predictor's cache for frame features; None: no cache
-    graphs: CUDA graphs for small batches, if the predictor can use them; None: all passes are plain
+    graphs: CUDA graphs for small batches, if the predictor has ``use_graphs``; None: all passes are plain
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Engine:
         self.cache = cache
         self.graphs = graphs
         if graphs is not None:
-            cast("GraphedPredictor[Any, Any]", predictor).use_graphs(graphs)
+            cast(Any, predictor).use_graphs(graphs)
 
     @classmethod
     def of(

@@ -19,16 +19,18 @@ from torch import Tensor
 
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.layers import concatenated
+from rfm.engine.predictor import prefix_indices
 from rfm.engine.threads import IN_TURN, FrameThreads
 from rfm.qwen.backbone import Box, plan, positions
 from rfm.qwen.batch import QwenPixels, Shots, VlmBatch, VlmRow
 from rfm.qwen.images import FRAMES_PER_GROUP, MERGE, Grid, QwenImages
-from rfm.qwen.leaves import Leaf, Packs, PlacedPack, calls, padded, starts
+from rfm.qwen.leaves import Leaf, Packs, PlacedPack, calls, padded
 from rfm.qwen.network import QWEN3, WRAPPED
 from rfm.qwen.video import Indices, Shot, SizedFrames, VlmVideo
 from rfm_client.contract import InvalidSampleError, Sample, Trajectory
 
 KEPT_TEXTS = 256  # cached conversations; an RL loop repeats the same task
+KEPT_PIECES = 4096  # cached tokens of conversations, and of prompts and times
 MAX_KEPT_BYTES = 16_384  # per conversation text; a task and 128 frames have fewer. A byte is at most one token
 FRAME_BYTES = 64  # chat template text per frame, about
 
@@ -46,7 +48,7 @@ class Chat:
     def __init__(self, tokenizer: Any) -> None:
         self._tokenizer = tokenizer
         self._text = lru_cache(KEPT_TEXTS)(self._render)
-        self._tokens = lru_cache(KEPT_TEXTS)(self._tokenise)
+        self._tokens = lru_cache(KEPT_PIECES)(self._tokenise)
 
     def text(self, parts: tuple[str | Visual, ...]) -> str:
         """Return the chat template's text for one user message."""
@@ -159,9 +161,10 @@ class QwenCollator:
         packs = [PlacedPack(index, row.num_tokens, pack) for index, row in enumerate(rows) for pack in row.packs]
         made, first = [], dict[Leaf, int]()
         for call in calls(packs):
-            made.append(padded(call, self.tokenizer.pad_token_id, self.visual_pad, features))
-            first |= {leaf: num_slots + start for leaf, start in starts(call).items()}
-            num_slots += made[-1].input_ids.numel()
+            of_call, starts = padded(call, self.tokenizer.pad_token_id, self.visual_pad, features)
+            made.append(of_call)
+            first |= {leaf: num_slots + start for leaf, start in starts.items()}
+            num_slots += of_call.input_ids.numel()
         return tuple(made), first
 
     def _positions(self, ids: Indices, token: str) -> Indices:
@@ -250,13 +253,19 @@ class QwenCollator:
 
 
 def video_of(trajectory: Trajectory, frame_steps: int) -> VlmVideo:
-    """Return a trajectory's frames as a video. Raises InvalidSampleError for embeddings."""
+    """Return a trajectory's frames as a video. Raises InvalidSampleError for embeddings.
+
+    frame_steps: for dense mode; 0: one conversation with all frames
+    """
+    frames: Any = trajectory.frames
+    digests = None
     if trajectory.named is not None:
         digests, frames = zip(*trajectory.named, strict=True)
-        return VlmVideo.of(frames, frame_steps, digests)
-    if trajectory.frames is None:
+    if frames is None:
         raise InvalidSampleError.at("video_embeddings", "frames (this checkpoint reads raw frames)", "embeddings")
-    return VlmVideo.of(trajectory.frames, frame_steps)
+    count = len(frames)
+    conversations = list(prefix_indices(count, frame_steps)) if frame_steps else [np.arange(count)]
+    return VlmVideo(frames, frame_steps or count, conversations, digests)
 
 
 def expanded(ids: Indices, pad: int, lengths: Sequence[int]) -> Indices:

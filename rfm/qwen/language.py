@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -24,7 +23,7 @@ from rfm.qwen.backbone import Box, KeyValues, positions
 from rfm.qwen.batch import VlmBatch, VlmRow
 from rfm.qwen.checkpoint import QwenCheckpoint
 from rfm.qwen.collator import VIDEO_PAD, VISION_END, VISION_START, QwenCollator, expanded, timed_groups, video_of
-from rfm.qwen.images import MERGE, QwenImages
+from rfm.qwen.images import MERGE
 from rfm.qwen.network import BackboneConfig, qwen_states
 from rfm.qwen.processor import (
     SIZED_BY_PROCESSOR,
@@ -43,7 +42,6 @@ if TYPE_CHECKING:
 
 VIDEO = VISION_START + VIDEO_PAD + VISION_END  # a video, or a temporal patch, in a prompt's text
 HEAD, EMBEDDING = "lm_head.weight", "model.language_model.embed_tokens.weight"
-MOST_PIECES = 4096  # cached prompt and time texts
 
 
 @dataclass(frozen=True)
@@ -109,10 +107,6 @@ class LanguageNetwork(nn.Module):
 class LanguageCollator(QwenCollator):
     """The collator for prompts with one video, every temporal patch behind its time."""
 
-    def __init__(self, config: Any, tokenizer: Any, images: QwenImages) -> None:
-        super().__init__(config, tokenizer, images)
-        self._piece = lru_cache(MOST_PIECES)(self._chat.tokens)
-
     def check_template(self) -> None:
         """Raise CheckpointError unless a prompt has its video once."""
         num_videos = self.example().count(VIDEO)
@@ -149,7 +143,7 @@ class LanguageCollator(QwenCollator):
         first, *others = self._around(*(timed_groups([time_s]) for time_s in times_s))
         # All pieces but the last end with a special token, so tokenising them separately gives the text's own tokens.
         pieces = [before + first, *others, behind]
-        tokens = np.concatenate([*map(self._piece, pieces), more]).astype(np.int64)
+        tokens = np.concatenate([*map(self._chat.tokens, pieces), more]).astype(np.int64)
         pad = self.tokenizer.convert_tokens_to_ids(VIDEO_PAD)
         ids = expanded(tokens, pad, [grid.tokens_per_group] * len(times_s))
         starts = self._positions(ids, VISION_START) + 1

@@ -121,20 +121,16 @@ class QwenPredictor:
 
     def _keep(self, rows: Sequence[VlmRow], layout: Layout, made: torch.Tensor | None) -> None:
         """Cache the videos' frames and new features; skip videos larger than the cache."""
-        if self.cache is None:
+        cache = self.cache
+        if cache is None:
             return
         with suppress(torch.OutOfMemoryError), memory_errors():  # the scores are complete without the cache
-            self._keep_all(self.cache, rows, layout, made)
-
-    @staticmethod
-    def _keep_all(cache: FeatureCache[Any], rows: Sequence[VlmRow], layout: Layout, made: torch.Tensor | None) -> None:
-        for video in dict.fromkeys(video for row in rows for video in row.videos):
-            frames = dict(zip(video.digests, video.frames, strict=True))
-            if sum(frame.nbytes for frame in frames.values()) > cache.limit_bytes:
-                continue
-            known = cache.found(frames)
-            for digest in frames.keys() - known.keys():
-                cache.keep({digest: frames[digest].copy()})
-            for key in video.ready.keys.values():
-                if made is not None and key in layout.made:
-                    cache.keep({key: made[layout.made[key]].clone()})
+            for video in dict.fromkeys(video for row in rows for video in row.videos):
+                frames = dict(zip(video.digests, video.frames, strict=True))
+                if sum(frame.nbytes for frame in frames.values()) > cache.limit_bytes:
+                    continue
+                for digest in frames.keys() - cache.found(frames).keys():
+                    cache.keep({digest: frames[digest].copy()})
+                for key in video.ready.keys.values():
+                    if made is not None and key in layout.made:
+                        cache.keep({key: made[layout.made[key]].clone()})
