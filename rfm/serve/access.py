@@ -19,9 +19,8 @@ from rfm.serve.installation import ServerStartError
 from rfm_client.contract.addresses import ListenAddress, check_authorities, check_certificate, in_url, is_loopback
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidValueError
-from rfm_client.contract.wire import ADMIN_KEY_VARIABLE
+from rfm_client.contract.wire import ADMIN_KEY_VARIABLE as VARIABLE
 
-VARIABLE = ADMIN_KEY_VARIABLE
 HEADER = "rfm-admin-key"
 MIN_CHARACTERS = 16
 _GRPC_PREFIX = "triton-grpc-protocol-"  # Triton puts it before the header name
@@ -93,10 +92,8 @@ def _checked(text: str, where: str) -> str:
 
 PORTS = range(20_000, 32_000)  # below the ports that Linux assigns to outgoing connections
 PORT_STEP = 20  # keeps the three defaults distinct
-SECURITY_FLOOR = (
-    2,
-    71,
-)  # Triton of NVIDIA's container 26.07; earlier versions have remote vulnerabilities: docs/guides/deploy.md, "Ports"
+# Triton of NVIDIA's container 26.07; earlier versions have remote vulnerabilities: docs/guides/deploy.md, "Ports"
+SECURITY_FLOOR = 2, 71
 _given: deque[int] = deque(maxlen=256)  # ports handed out, whose servers may not listen yet
 
 

@@ -21,7 +21,6 @@ from contextlib import suppress
 from functools import partial
 from urllib.parse import quote
 
-from rfm.serve.access import http_headers
 from rfm.serve.probe import NO_ANSWER, Http, Probe, can_be_probed
 from rfm.serve.processes import ModelProcesses
 from rfm.serve.repository_api import INDEX_PATH, LOADING, UNLOADING, ModelVersion, versions_of
@@ -60,9 +59,8 @@ class TritonWatch:
         silent_s: float,
         served: Mapping[str, Config],
     ) -> None:
-        endpoints = server.endpoints
-        self._http = Http(endpoints.http_host, endpoints.http_port, http_headers(server.admin_key))
-        self._metrics = Http(endpoints.host, endpoints.metrics_port)
+        self._http = server.http
+        self._metrics = Http(server.endpoints.host, server.endpoints.metrics_port)
         self._new_probe = partial(Probe, self._http, interval_s=probe_s, hang_s=hang_s)
         self._silent_s = silent_s
         self._status = status
