@@ -31,11 +31,6 @@ def memory_errors() -> Iterator[None]:
         raise torch.OutOfMemoryError(str(error)) from error
 
 
-def free_unused() -> None:
-    """Free the GPU memory that PyTorch caches; do nothing without a GPU."""
-    torch.cuda.empty_cache()
-
-
 def use(device: torch.device) -> None:
     """Make ``device`` the current device for this thread.
 
@@ -43,11 +38,6 @@ def use(device: torch.device) -> None:
     """
     if device.type == "cuda":
         torch.cuda.set_device(device)
-
-
-def pinned(tensor: Tensor) -> Tensor:
-    """Return the tensor in pinned memory, from which a GPU copies asynchronously."""
-    return tensor.pin_memory()
 
 
 class Copies:
@@ -62,7 +52,7 @@ class Copies:
         if self._stream is None:
             return pixels
         with torch.cuda.stream(self._stream):  # PyTorch keeps the pinned copy until this stream has read it
-            return pinned(pixels).to(self._stream.device, non_blocking=True)
+            return pixels.pin_memory().to(self._stream.device, non_blocking=True)
 
     def wait_for(self, pixels: Iterable[Tensor]) -> None:
         """Make the current stream, not the host, wait for all copies started so far.

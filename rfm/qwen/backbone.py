@@ -29,7 +29,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from rfm.engine.layers import concatenated
-from rfm.files import CheckpointError
 from rfm.qwen.images import MERGE, Grid
 
 
@@ -258,7 +257,6 @@ def _windows(grids: Sequence[Grid], side: int) -> tuple[Runs, Indices]:
     return tuple(runs), np.concatenate(order)
 
 
-FULL_ATTENTION = "full_attention"
 ROOM = 16  # slots that KeyValues adds at a time
 
 
@@ -378,10 +376,3 @@ def next_hidden_state(
     key_values.place(before, longest)
     inputs = {"input_ids": ids[:, None], "position_ids": at[None, :, None].expand(3, -1, -1)}
     return run_layers(language, Part(language, inputs, None, key_values, lambda: is_seen))
-
-
-def check_attention(backbone: Any) -> None:
-    """Raise CheckpointError for a language model with layers that do not attend to all earlier tokens."""
-    kinds = set(getattr(backbone.config.get_text_config(), "layer_types", None) or [FULL_ATTENTION])
-    if kinds != {FULL_ATTENTION}:
-        raise CheckpointError.at("text_config.layer_types", f"{FULL_ATTENTION} alone", sorted(kinds))

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rfm.engine.device import pinned
 from rfm.engine.layers import changed, concatenated
 from rfm.qwen.backbone import VisionPlan
 from rfm.qwen.images import Grid, QwenImages
@@ -227,8 +226,8 @@ class VlmBatch:
         return sum(ids.numel() for ids in (self.inputs["input_ids"], *(packs.input_ids for packs in self.packs)))
 
     def pinned(self) -> VlmBatch:
-        """Return the batch with all tensors except the frames in pinned memory."""
-        return self._changed(pinned)
+        """Return the batch with all tensors except the frames in pinned memory, from which a GPU copies meanwhile."""
+        return self._changed(Tensor.pin_memory)
 
     def to(self, device: torch.device, dtype: torch.dtype) -> VlmBatch:
         """Return the batch on ``device``, where pixels are normalised, cut into patches and converted to ``dtype``."""

@@ -21,12 +21,12 @@ from torch import Tensor, nn
 from rfm.config import VideoPrompt, Weights
 from rfm.engine.graphs import Graphs
 from rfm.engine.layers import changed, concatenated
+from rfm.files import CheckpointError
 from rfm.qwen.backbone import (
     UNIT,
     KeyValues,
     Part,
     VisionPlan,
-    check_attention,
     features,
     run_layers,
 )
@@ -38,6 +38,7 @@ BACKBONES = {QWEN_2_5: "Qwen2_5_VLModel", "qwen3_vl": "Qwen3VLModel"}
 QWEN3 = "qwen3_vl"
 BARE: Final = "bare"
 WRAPPED: Final = "wrapped"
+FULL_ATTENTION = "full_attention"
 Dtype: TypeAlias = Literal["float32", "bfloat16", "float16"]
 
 
@@ -97,7 +98,10 @@ def qwen_states(
 
 
 def build_backbone(config: BackboneConfig, dtype: torch.dtype) -> nn.Module:
-    """Return the backbone with uninitialised weights in ``dtype``; buffers keep their own dtype."""
+    """Return the backbone with uninitialised weights in ``dtype``; buffers keep their own dtype.
+
+    Raises CheckpointError for a language model with other layers than full attention.
+    """
     try:
         import transformers
     except ImportError as error:
@@ -106,7 +110,9 @@ def build_backbone(config: BackboneConfig, dtype: torch.dtype) -> nn.Module:
     settings = network.config_class.from_dict(config.backbone)
     with _no_init_weights():
         backbone: nn.Module = network._from_config(settings, dtype=dtype, attn_implementation="sdpa")
-    check_attention(backbone)
+    kinds = set(getattr(settings.get_text_config(), "layer_types", None) or [FULL_ATTENTION])
+    if kinds != {FULL_ATTENTION}:  # other layers do not attend to all earlier tokens
+        raise CheckpointError.at("text_config.layer_types", f"{FULL_ATTENTION} alone", sorted(kinds))
     return backbone
 
 

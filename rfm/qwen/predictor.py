@@ -15,15 +15,15 @@ from rfm.engine.execution import Execution
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.graphs import Graphs
 from rfm.engine.layers import speed_up
-from rfm.engine.predictor import RowScores, of_rows
+from rfm.engine.predictor import Predictor, RowScores
 from rfm.engine.threads import FrameThreads
 from rfm.qwen.batch import Layout, VlmBatch, VlmRow
 from rfm.qwen.collator import QwenCollator
 from rfm.qwen.tree import trees
-from rfm_client.contract import FrameScores, InvalidSampleError, RewardError, Sample
+from rfm_client.contract import InvalidSampleError, RewardError, Sample
 
 
-class QwenPredictor:
+class QwenPredictor(Predictor[VlmRow, VlmBatch]):
     """A reward model on a Qwen backbone, on a device. A family implements ``score``.
 
     cache: holds frames, which requests may name, and temporal patch features; None: no cache
@@ -31,8 +31,6 @@ class QwenPredictor:
     """
 
     works_ahead = True
-    has_progress = True
-    reads_views = False
 
     def __init__(
         self, network: Any, collator: QwenCollator, device: torch.device, cache: FeatureCache[Any] | None = None
@@ -101,10 +99,6 @@ class QwenPredictor:
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
         """Run one forward pass; return each row's scores or error."""
         raise NotImplementedError
-
-    def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
-        """Return frame scores for a progress sample, joined from all its rows."""
-        return of_rows(sample, rows)
 
     def _output(self, batch: VlmBatch, *arguments: Any) -> Any:
         """Return the network's output. Out of memory, free caches and graphs: the engine retries with fewer rows."""

@@ -19,8 +19,9 @@ from rfm.serve.installation import ServerStartError
 from rfm_client.contract.addresses import ListenAddress, check_authorities, check_certificate, in_url, is_loopback
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidValueError
-from rfm_client.contract.wire import ADMIN_KEY_VARIABLE as VARIABLE
+from rfm_client.contract.wire import ADMIN_KEY_VARIABLE
 
+VARIABLE = ADMIN_KEY_VARIABLE
 HEADER = "rfm-admin-key"
 MIN_CHARACTERS = 16
 _GRPC_PREFIX = "triton-grpc-protocol-"  # Triton puts it before the header name

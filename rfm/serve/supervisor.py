@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import logging
 import signal
-import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -14,6 +13,7 @@ from dataclasses import KW_ONLY, dataclass
 from types import FrameType
 
 from rfm.serve.installation import ServerStartError
+from rfm.serve.probe import NO_ANSWER, Http
 from rfm.serve.processes import ProcessGroup, clear_shared_memory, how_it_ended, stop_signals_to
 from rfm.serve.status import Status, StatusServer
 from rfm.serve.triton_server import POLL_S, Config, SpoiltStartError, TritonServer
@@ -66,7 +66,7 @@ class GatewayProcess:
     """
 
     def __init__(self, command: Sequence[str], address: tuple[str, int], silent_s: float) -> None:
-        self.command, self._address, self._silent_s = command, address, silent_s
+        self.command, self._http, self._silent_s = command, Http(*address), silent_s
         self._group: ProcessGroup | None = None
         self._started_s = 0.0
         self._fault: str | None = None
@@ -82,22 +82,16 @@ class GatewayProcess:
         num_missed = 0
         while group.process.poll() is None:
             try:
-                self._ask()
+                self._http.request("HEAD", "/", self._silent_s / TRIES)
                 num_missed = 0
             except TimeoutError:
                 num_missed += 1
-            except OSError:  # it does not listen yet, or has ended
+            except NO_ANSWER:  # it does not listen yet, has ended, or requires TLS, which is a sign of life
                 num_missed = 0
             if num_missed == TRIES:
                 self._fault = f"no answer for {self._silent_s:g} s"
                 group.kill()
             time.sleep(ASK_S)
-
-    def _ask(self) -> None:
-        """Wait for a sign of life: a response, even one that refuses, or the end of a connection that requires TLS."""
-        with socket.create_connection(self._address, self._silent_s / TRIES) as connection:
-            connection.sendall(b"HEAD / HTTP/1.0\r\n\r\n")
-            connection.recv(1)
 
     def look(self) -> str | None:
         """Restart an ended gateway, at least GATEWAY_PAUSE_S after its start. Return why it ended; None: no restart."""

@@ -17,7 +17,7 @@ from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.engine.device import use
 from rfm.engine.layers import keep_float32
-from rfm.engine.threads import num_preparing, use_threads
+from rfm.engine.threads import use_threads
 from rfm.files import CheckpointError, is_there, weights_digest
 from rfm.parameters import THREADS_PARAMETER
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description, num_instances
@@ -31,11 +31,6 @@ class Placement:
 
     device: torch.device
     num_threads: int
-
-    @property
-    def num_preparing(self) -> int:
-        """How many requests are prepared at the same time."""
-        return num_preparing(self.device, self.num_threads)
 
     @classmethod
     def of(cls, args: Mapping[str, str], config: Mapping[str, Any], settings: Mapping[str, str]) -> Placement:

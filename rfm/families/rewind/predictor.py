@@ -15,10 +15,9 @@ import torch
 
 from rfm.engine.execution import Execution
 from rfm.engine.layers import as_tensor
-from rfm.engine.predictor import RowScores, check_type, frame_scores, of_rows, prefix_indices
+from rfm.engine.predictor import Predictor, RowScores, check_type, frame_scores, prefix_indices
 from rfm.families.rewind.network import RewindBatch, RewindConfig, RewindTransformer, rounded_up
 from rfm_client.contract import (
-    FrameScores,
     InvalidSampleError,
     ProgressSample,
     RewardError,
@@ -141,15 +140,11 @@ def _check_range(where: str, embeddings: Float32Array) -> None:
         raise InvalidSampleError.at(where, f"values from {-MAX_EMBEDDING:g} to {MAX_EMBEDDING:g}", f"{largest:g}")
 
 
-class RewindPredictor:
+class RewindPredictor(Predictor[RewindRow, RewindBatch]):
     """A ReWiND network on a device.
 
     dtype: of the network; any but float32 changes scores by more than 1e-5
     """
-
-    works_ahead = False
-    has_progress = True
-    reads_views = False
 
     def __init__(self, network: RewindTransformer, device: torch.device, dtype: torch.dtype = torch.float32) -> None:
         self.network = network.to(device, dtype).eval()
@@ -169,13 +164,6 @@ class RewindPredictor:
     def num_tokens(self, row: RewindRow) -> int:
         """Return how many tokens the row has."""
         return self.network.config.num_tokens(row.num_first, row.num_second)
-
-    def sequences(self, row: RewindRow) -> Sequence[RewindRow]:
-        """Return the row, which is one sequence."""
-        return (row,)
-
-    def work_ahead(self, rows: Sequence[RewindRow]) -> None:
-        """Do nothing: collation is cheap."""
 
     def collate(self, rows: Sequence[RewindRow]) -> RewindBatch:
         """Return one batch with rows of any kind."""
@@ -206,7 +194,3 @@ class RewindPredictor:
             scored.append(RowScores(of_trajectories, query))
             start = end
         return list(scored)
-
-    def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
-        """Return frame scores for a progress sample, joined from all its rows."""
-        return of_rows(sample, rows)
