@@ -60,7 +60,6 @@ class QwenCheckpoint:
         return self.load_collator()
 
     def load_collator(self) -> QwenCollator:
-        """Return the sample collator. Raises CheckpointError if the processor is missing or does not fit."""
         raise NotImplementedError
 
     def network(self, dtype: torch.dtype) -> nn.Module:
@@ -69,7 +68,6 @@ class QwenCheckpoint:
         return network
 
     def skeleton(self) -> nn.Module:
-        """Return the network without weights."""
         with torch.device("meta"):
             return self.network(self.config.torch_dtype)
 

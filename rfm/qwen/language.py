@@ -188,7 +188,6 @@ class LanguageCheckpoint(QwenCheckpoint):
         return checkpoint
 
     def load_collator(self) -> LanguageCollator:
-        """Return the sample collator. Raises CheckpointError if the processor is missing or does not fit."""
         tokenizer, preprocessor = read_processor(self.processor, videos=self.reads_videos)
         num_rows = self.config.backbone["text_config"]["vocab_size"]
         if len(tokenizer) > num_rows:
@@ -210,7 +209,6 @@ class LanguageCheckpoint(QwenCheckpoint):
         return {**weights, **({HEAD: weights[EMBEDDING]} if is_tied else {})}
 
     def saved_settings(self) -> dict[str, Any]:
-        """Return this project's fields for an exported config.json."""
         return {REWARD_MODEL: self.config.reward_model, **super().saved_settings()}
 
     def build(self, dtype: torch.dtype | None = None) -> Any:

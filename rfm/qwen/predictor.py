@@ -47,7 +47,6 @@ class QwenPredictor(Predictor[VlmRow, VlmBatch]):
 
     @property
     def has_success(self) -> bool:
-        """True if the network predicts success."""
         return bool(self.network.config.has_success)
 
     def use_graphs(self, graphs: Graphs) -> None:
@@ -67,11 +66,9 @@ class QwenPredictor(Predictor[VlmRow, VlmBatch]):
         return trees(rows, self.collator.visual_pad, are_images=self.collator.config.multi_image)
 
     def num_tokens(self, row: VlmRow) -> int:
-        """Return how many tokens the language model computes."""
         return row.cost
 
     def sequences(self, row: VlmRow) -> Sequence[VlmRow]:
-        """Return the conversations in the row."""
         return row.alone or (row,)
 
     def work_ahead(self, rows: Sequence[VlmRow]) -> None:
@@ -82,7 +79,6 @@ class QwenPredictor(Predictor[VlmRow, VlmBatch]):
                 video.sized = replace(sized, pixels=self._copies.send(sized.pixels))
 
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
-        """Return one batch with conversations of any kind."""
         self.work_ahead(rows)
         graphs = self.network.graphs
         length = None if graphs is None else graphs.padded(len(rows), max(row.num_tokens for row in rows))
@@ -97,7 +93,6 @@ class QwenPredictor(Predictor[VlmRow, VlmBatch]):
         execution.cache_bytes = None if self.cache is None else self.cache.num_bytes
 
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
-        """Run one forward pass; return each row's scores or error."""
         raise NotImplementedError
 
     def _output(self, batch: VlmBatch, *arguments: Any) -> Any:

@@ -116,14 +116,13 @@ class Supervisor:
 
     gateway: a gateway beside the server; None: no gateway
     status_port: port for the status server, on Triton's host; None: no status server
-    probe_s, hang_s, triton_silent_s: see TritonWatch
+    probe_s, triton_silent_s: see TritonWatch
     tell_ready: called once when all models are ready for the first time; None: log a line instead
     """
 
     server: TritonServer
     _: KW_ONLY
     probe_s: float
-    hang_s: float
     triton_silent_s: float
     gateway: GatewayProcess | None = None
     status_port: int | None = None
@@ -132,7 +131,7 @@ class Supervisor:
     def __post_init__(self) -> None:
         self._status = Status()
         self._is_to_stop = threading.Event()
-        self._faults = FaultCount(STEADY_S + self.hang_s)
+        self._faults = FaultCount(STEADY_S + self.server.hang_s)
         self._watch: TritonWatch | None = None  # None: Triton is starting, or has ended
         self._served: dict[str, Config] | None = None  # configurations before the restart; None: first start
 
@@ -141,8 +140,8 @@ class Supervisor:
         for path in clear_shared_memory():
             logger.info("removed %s, left by a killed server", path)
         self._status.record(dict.fromkeys(self.server.models, "it is loading"))
-        for what in (TRITON, *self.server.models, *(() if self.gateway is None else (GATEWAY,))):
-            self._status.restarts.labels(what)  # begins at 0, so that the first restart is an increase
+        for what in (TRITON,) if self.gateway is None else (TRITON, GATEWAY):
+            self._status.restarts.labels(what)  # begins at 0, as those of the models
         port, host = self.status_port, self.server.endpoints.host
         with (
             stop_signals_to(self._stop),
@@ -181,12 +180,7 @@ class Supervisor:
             (self.tell_ready or self._log_ready)()
         self._faults.started()
         self._watch = TritonWatch(
-            self.server,
-            self._status,
-            probe_s=self.probe_s,
-            hang_s=self.hang_s,
-            silent_s=self.triton_silent_s,
-            served=self._served or {},
+            self.server, probe_s=self.probe_s, silent_s=self.triton_silent_s, served=self._served or {}
         )
 
     def _log_ready(self) -> None:

@@ -128,7 +128,7 @@ class TritonServer:
     The server ends with this process, however this process ends.
 
     http_threads: threads that read HTTP requests; None: Triton's choice
-    hang_s: a model process ends itself after a batch makes no progress for this long
+    hang_s: a model without progress for this long counts as hung; in a batch, its process ends itself
     log: file for Triton's log; None: warnings and errors go to this process's standard error
     admin_key: key for the restricted APIs; default: a new random key
     accepts_known_vulnerabilities: True: listen on any address, even with a vulnerable Triton

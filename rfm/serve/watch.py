@@ -1,13 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Watch a running Triton: its served models, their readiness, and faults.
+"""Watch a running Triton: its served models, their readiness, and faults (docs/explanation/faults.md).
 
-| fault | found by |
-|---|---|
-| Triton is silent | ``/metrics`` does not respond |
-| a model process is dead or stopped, also during a load | ``ModelProcesses`` |
-| a model hangs outside a batch, or its requests fail before they reach model.py | ``Probe`` |
-
-A process with a hung batch or a broken device ends itself (``rfm.triton_model.watchdog``).
+A silent Triton answers no ``/metrics``; ``ModelProcesses`` finds dead and stopped processes; a ``Probe`` finds a model
+that hangs outside a batch, or whose requests fail before they reach model.py.
 """
 
 from __future__ import annotations
@@ -24,7 +19,7 @@ from urllib.parse import quote
 from rfm.serve.probe import NO_ANSWER, Http, Probe, can_be_probed
 from rfm.serve.processes import ModelProcesses
 from rfm.serve.repository_api import INDEX_PATH, LOADING, UNLOADING, ModelVersion, versions_of
-from rfm.serve.status import NO_REASON, Status
+from rfm.serve.status import NO_REASON
 from rfm.serve.triton_server import Config, TritonServer
 from rfm_client.contract.description import num_instances
 
@@ -44,26 +39,15 @@ class TritonWatch:
     """Looks at Triton every LOOK_S in its own thread, until ``close``.
 
     probe_s: seconds between a model's probes
-    hang_s: a model without a response for this long counts as hung
     silent_s: a Triton without a response for this long counts as silent
     served: configurations of the models to serve; the watch adds those it finds
     """
 
-    def __init__(
-        self,
-        server: TritonServer,
-        status: Status,
-        *,
-        probe_s: float,
-        hang_s: float,
-        silent_s: float,
-        served: Mapping[str, Config],
-    ) -> None:
+    def __init__(self, server: TritonServer, *, probe_s: float, silent_s: float, served: Mapping[str, Config]) -> None:
         self._http = server.http
         self._metrics = Http(server.endpoints.host, server.endpoints.metrics_port)
-        self._new_probe = partial(Probe, self._http, interval_s=probe_s, hang_s=hang_s)
+        self._new_probe = partial(Probe, self._http, interval_s=probe_s, hang_s=server.hang_s)
         self._silent_s = silent_s
-        self._status = status
         self._processes = ModelProcesses(server.pid)
         self._probes: dict[str, Probe] = {}
         self._counts: dict[str, float] = {}
@@ -157,7 +141,6 @@ class TritonWatch:
         elif model not in self._going and ready != self._ready.get(model):
             path = f"/v2/models/{quote(model, safe='')}/versions/{max(ready)}/config"
             self.served[model] = serving_just(self._http.json(path), ready)
-            self._status.restarts.labels(model)  # begins at 0, so that the first restart is an increase
             before = self._probes.get(model)
             self._forget(model)
             if can_be_probed(self.served[model]):
