@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+TORCH = f"torch {torch.__version__}"
 ATTENTION = "scaled_dot_product_attention"
 
 
@@ -20,13 +21,4 @@ def computation(checkpoint: Any, dtype: torch.dtype | None, *, on_gpu: bool) -> 
     """
     if dtype is None:
         dtype = getattr(checkpoint.config, "torch_dtype", torch.float32) if on_gpu else torch.float32
-    return f"{str(dtype).removeprefix('torch.')}, {_torch()}, {ATTENTION}"
-
-
-def is_by_this_torch(stated: str) -> bool:
-    """Return True if ``stated``, from ``computation``, names the running PyTorch version."""
-    return _torch() in stated.split(", ")
-
-
-def _torch() -> str:
-    return f"torch {torch.__version__}"
+    return f"{str(dtype).removeprefix('torch.')}, {TORCH}, {ATTENTION}"

@@ -11,7 +11,7 @@ import logging
 import re
 import threading
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from functools import partial
 from urllib.parse import quote
@@ -140,7 +140,7 @@ class TritonWatch:
             self._forget(model)
         elif model not in self._going and ready != self._ready.get(model):
             path = f"/v2/models/{quote(model, safe='')}/versions/{max(ready)}/config"
-            self.served[model] = serving_just(self._http.json(path), ready)
+            self.served[model] = {**self._http.json(path), "version_policy": {"specific": {"versions": [*ready]}}}
             before = self._probes.get(model)
             self._forget(model)
             if can_be_probed(self.served[model]):
@@ -170,8 +170,3 @@ class TritonWatch:
 def parts_of(config: Config) -> list[str]:
     """Return the models in an ensemble; empty for other models."""
     return [step["model_name"] for step in config.get("ensemble_scheduling", {}).get("step", [])]
-
-
-def serving_just(config: Config, versions: Sequence[int]) -> Config:
-    """Return a model's configuration, restricted to these versions."""
-    return {**config, "version_policy": {"specific": {"versions": list(versions)}}}

@@ -69,17 +69,12 @@ def check_digest(version: Path, expected: str | None) -> None:
     """
     kept = version / "config.pbtxt"
     if is_there(kept):
-        expected = _digest_in(kept)
+        try:
+            config = text_format.Parse(kept.read_text(), pb.ModelConfig())
+            expected = Description.parse(config.parameters[DESCRIPTION_PARAMETER].string_value).weights_digest
+        except (OSError, ValueError, text_format.ParseError) as error:
+            raise CheckpointError.at(kept, "a configuration of the export", error, "export again") from error
     if expected and (got := weights_digest([version])) != expected:
         raise CheckpointError.at(
             version, f"the weights that were exported ({expected})", f"others ({got})", "export them again"
         )
-
-
-def _digest_in(file: Path) -> str | None:
-    """Return the weights' digest from an exported configuration; None: unknown."""
-    try:
-        config = text_format.Parse(file.read_text(), pb.ModelConfig())
-        return Description.parse(config.parameters[DESCRIPTION_PARAMETER].string_value).weights_digest
-    except (OSError, ValueError, text_format.ParseError) as error:
-        raise CheckpointError.at(file, "a configuration of the export", error, "export again") from error
