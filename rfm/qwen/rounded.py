@@ -80,7 +80,9 @@ class Nf4Linear(RoundedLinear):
         super().__init__(layer, rank)
         self._bitsandbytes = _bitsandbytes()
         count = self.out_features * self.in_features
-        self._block_size = block_size(count, len(scale))
+        self._block_size = max(
+            NF4_BLOCK_SIZES[0], 1 << (math.ceil(count / len(scale)) - 1).bit_length()
+        )  # a power of 2
         num_blocks = math.ceil(count / self._block_size)
         packed = self.out_features, self.in_features // VALUES_PER_BYTE
         self.register_buffer("weight", torch.empty(packed, dtype=torch.uint8, device="meta"))
@@ -173,8 +175,3 @@ def of_layer(name: str, codes: Tensor, scales: Tensor, dtype: torch.dtype) -> di
     """Return a layer's tensors by name. name: weight name; dtype: type of decoded values."""
     path = name.removesuffix(".weight")
     return {name: codes, path + SCALE: scales, path + DECODED: torch.empty(0, dtype=dtype)}
-
-
-def block_size(num_values: int, num_blocks: int) -> int:
-    """Return how many values a block has, a power of 2."""
-    return max(NF4_BLOCK_SIZES[0], 1 << (math.ceil(num_values / num_blocks) - 1).bit_length())

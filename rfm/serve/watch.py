@@ -163,10 +163,7 @@ class TritonWatch:
         probe = self._probes.get(model)
         if probe is not None and not probe.has_answered:
             return "it has not answered a probe yet"
-        reasons = {part: self._reason(part, versions) for part in parts_of(self.served[model]) if part in self.served}
+        steps = self.served[model].get("ensemble_scheduling", {}).get("step", [])
+        parts = [step["model_name"] for step in steps if step["model_name"] in self.served]
+        reasons = {part: self._reason(part, versions) for part in parts}
         return next((f"{part}: {reason}" for part, reason in reasons.items() if reason != NO_REASON), NO_REASON)
-
-
-def parts_of(config: Config) -> list[str]:
-    """Return the models in an ensemble; empty for other models."""
-    return [step["model_name"] for step in config.get("ensemble_scheduling", {}).get("step", [])]
