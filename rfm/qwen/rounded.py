@@ -80,9 +80,8 @@ class Nf4Linear(RoundedLinear):
         super().__init__(layer, rank)
         self._bitsandbytes = _bitsandbytes()
         count = self.out_features * self.in_features
-        self._block_size = max(
-            NF4_BLOCK_SIZES[0], 1 << (math.ceil(count / len(scale)) - 1).bit_length()
-        )  # a power of 2
+        # The power of 2 from which these scales result.
+        self._block_size = max(NF4_BLOCK_SIZES[0], 1 << (math.ceil(count / len(scale)) - 1).bit_length())
         num_blocks = math.ceil(count / self._block_size)
         packed = self.out_features, self.in_features // VALUES_PER_BYTE
         self.register_buffer("weight", torch.empty(packed, dtype=torch.uint8, device="meta"))
