@@ -28,7 +28,8 @@ LOOKS = 3  # in a row without an answer, before Triton counts as silent
 _TIMEOUT_S = 1.5
 _INDEX_TIMEOUT_S = 5.0
 _PROGRESS = re.compile(  # counters that grow while a model makes progress
-    r'^(?:nv_inference_request_success|rfm_forward_passes_total)\{[^}]*\bmodel="(?P<model>[^"]+)".*\} (?P<count>\S+)$',
+    r'^(?P<series>(?:nv_inference_request_success|rfm_forward_passes_total)\{[^}]*\bmodel="(?P<model>[^"]+)".*\}) '
+    r"(?P<count>\S+)$",
     re.MULTILINE,
 )
 TRITON = "triton"
@@ -50,7 +51,7 @@ class TritonWatch:
         self._silent_s = silent_s
         self._processes = ModelProcesses(server.pid)
         self._probes: dict[str, Probe] = {}
-        self._counts: dict[str, float] = {}
+        self._counts: dict[str, str] = {}  # by series
         self._progress_s: dict[str, float] = {}  # when a model last made progress
         self._ready: dict[str, list[int]] = {}  # ready versions by model
         self._going: set[str] = set()  # models that are loading or unloading
@@ -95,12 +96,9 @@ class TritonWatch:
                 logger.exception("an unexpected error")
 
     def _note_progress(self, metrics: str) -> None:
-        counts: dict[str, float] = {}
         for match in _PROGRESS.finditer(metrics):
-            counts[match["model"]] = counts.get(match["model"], 0.0) + float(match["count"])
-        for model, count in counts.items():
-            if count != self._counts.get(model):
-                self._counts[model], self._progress_s[model] = count, time.monotonic()
+            if match["count"] != self._counts.get(match["series"]):
+                self._counts[match["series"]], self._progress_s[match["model"]] = match["count"], time.monotonic()
 
     def _dead(self) -> tuple[str, str] | None:
         found = self._processes.fault(self._wanted, is_settled=not self._going)
