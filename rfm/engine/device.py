@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""CUDA calls for memory, streams and the current device, and out-of-memory errors.
+"""Devices: memory, streams, the current device, out-of-memory errors, and what decides a score's last digits.
 
+PyTorch chooses the kernel for ``scaled_dot_product_attention`` by its version, the GPU, the dtype and the shapes.
 ``tests/support/pretended.py`` replaces CUDA functions, so tests run the same code without a GPU.
 """
 
@@ -9,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -65,3 +67,17 @@ class Copies:
         current.wait_stream(self._stream)
         for each in pixels:
             each.record_stream(current)
+
+
+TORCH = f"torch {torch.__version__}"
+ATTENTION = "scaled_dot_product_attention"
+
+
+def computation(checkpoint: Any, dtype: torch.dtype | None, *, on_gpu: bool) -> str:
+    """Return number type, PyTorch version and attention as one line.
+
+    dtype: network dtype; None: float32 on the CPU, otherwise the checkpoint's own
+    """
+    if dtype is None:
+        dtype = getattr(checkpoint.config, "torch_dtype", torch.float32) if on_gpu else torch.float32
+    return f"{str(dtype).removeprefix('torch.')}, {TORCH}, {ATTENTION}"

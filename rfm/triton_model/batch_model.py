@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeAlias, TypeVar
 
 import torch
 
-from rfm.engine.computation import TORCH
+from rfm.engine.device import TORCH
 from rfm.engine.execution import Execution
 from rfm.parameters import BUDGET_PARAMETER, DEFAULT_HANG_S, HANG_VARIABLE
 from rfm.probe_request import probe_request
