@@ -203,7 +203,6 @@ def serve(
             gateway=None if beside is None else _gateway_process(beside, config),
             status_port=config.serve.status_port,
             probe_s=config.serve.probe_s,
-            hang_s=config.serve.hang_s,
             triton_silent_s=config.serve.triton_silent_s,
             tell_ready=None if screen is None else screen.show_ready,
         )

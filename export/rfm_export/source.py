@@ -24,7 +24,7 @@ from google.protobuf.text_format import ParseError
 
 from rfm import published
 from rfm.config import ExportConfig
-from rfm.engine.computation import computation
+from rfm.engine.device import computation
 from rfm.engine.family import NETWORK, Checkpoint, Family, FrameEncoders, config_fields
 from rfm.files import read_run_config
 from rfm.parameters import CHECKPOINT_FOLDER

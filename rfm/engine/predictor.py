@@ -12,7 +12,6 @@ import numpy.typing as npt
 from torch import Tensor
 
 from rfm.engine.execution import Execution
-from rfm.engine.graphs import Graphs
 from rfm.engine.layers import progress_from_logits
 from rfm_client.contract import (
     FrameScores,
@@ -76,15 +75,8 @@ class Predictor(Protocol[Row, Batch]):
         """
 
     def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
-        """Return frame scores for a progress sample, from all row scores."""
-        return of_rows(sample, rows)
-
-
-class GraphedPredictor(Predictor[Row, Batch], Protocol):
-    """A predictor that can score small batches with CUDA graphs: ``Description.uses_graphs``."""
-
-    def use_graphs(self, graphs: Graphs) -> None:
-        """Score small batches with these graphs from now on."""
+        """Return frame scores for a progress sample: the only row's; in dense mode, each prefix's last frame."""
+        return of_prefixes(rows) if getattr(sample, "frame_steps", 0) else rows[0].frames[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,11 +119,6 @@ def frame_scores(progress_logits: Tensor, success_logits: Tensor | None) -> Fram
         success=no_success(progress) if success_logits is None else success_logits.sigmoid().float().cpu().numpy(),
         progress_logits=progress_logits.float().cpu().numpy() if discrete else None,
     )
-
-
-def of_rows(sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
-    """Return scores for a progress sample: the only row's; in dense mode, each prefix's last frame."""
-    return of_prefixes(rows) if getattr(sample, "frame_steps", 0) else rows[0].frames[0]
 
 
 def of_prefixes(rows: Sequence[RowScores]) -> FrameScores:

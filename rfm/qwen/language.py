@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -44,7 +43,6 @@ if TYPE_CHECKING:
 
 VIDEO = VISION_START + VIDEO_PAD + VISION_END  # a video, or a temporal patch, in a prompt's text
 HEAD, EMBEDDING = "lm_head.weight", "model.language_model.embed_tokens.weight"
-MOST_PIECES = 4096  # cached prompt and time texts
 
 
 @dataclass(frozen=True)
@@ -104,15 +102,11 @@ class LanguageNetwork(nn.Module):
         key_values: receives the keys and values of all tokens
         """
         hidden, made = qwen_states(self.model, batch, key_values, self.graphs)
-        return LanguageOutput(self.lm_head(hidden[batch.query_rows, batch.query_tokens]), made)
+        return LanguageOutput(self.lm_head(hidden[batch.queries]), made)
 
 
 class LanguageCollator(QwenCollator):
     """The collator for prompts with one video, every temporal patch behind its time."""
-
-    def __init__(self, config: Any, tokenizer: Any, images: QwenImages) -> None:
-        super().__init__(config, tokenizer, images)
-        self._piece = lru_cache(MOST_PIECES)(self._chat.tokens)
 
     def check_template(self) -> None:
         """Raise CheckpointError unless a prompt has its video once."""
@@ -150,7 +144,7 @@ class LanguageCollator(QwenCollator):
         first, *others = self._around(*(timed_groups([time_s]) for time_s in times_s))
         # All pieces but the last end with a special token, so tokenising them separately gives the text's own tokens.
         pieces = [before + first, *others, behind]
-        tokens = np.concatenate([*map(self._piece, pieces), more]).astype(np.int64)
+        tokens = np.concatenate([*map(self._chat.tokens, pieces), more]).astype(np.int64)
         pad = self.tokenizer.convert_tokens_to_ids(VIDEO_PAD)
         ids = expanded(tokens, pad, [grid.tokens_per_group] * len(times_s))
         starts = self._positions(ids, VISION_START) + 1
@@ -195,8 +189,7 @@ class LanguageCheckpoint(QwenCheckpoint):
         checkpoint.check()
         return checkpoint
 
-    def load_collator(self) -> Any:
-        """Return the sample collator. Raises CheckpointError if the processor is missing or does not fit."""
+    def load_collator(self) -> LanguageCollator:
         tokenizer, preprocessor = read_processor(self.processor, videos=self.reads_videos)
         num_rows = self.config.backbone["text_config"]["vocab_size"]
         if len(tokenizer) > num_rows:
@@ -218,7 +211,6 @@ class LanguageCheckpoint(QwenCheckpoint):
         return {**weights, **({HEAD: weights[EMBEDDING]} if is_tied else {})}
 
     def saved_settings(self) -> dict[str, Any]:
-        """Return this project's fields for an exported config.json."""
         return {REWARD_MODEL: self.config.reward_model, **super().saved_settings()}
 
     def build(self, dtype: torch.dtype | None = None) -> Any:
