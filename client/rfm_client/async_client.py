@@ -248,9 +248,8 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         return await self._servers.is_ready((self.model, frames_name(self.model)), left_s)
 
     async def wait_ready(self, timeout_s: float) -> None:
-        """Wait until ``is_ready``. Raises DeadlineExceededError, or ServerUnavailableError for wrong ports."""
+        """Wait until ``is_ready``. Raises DeadlineExceededError."""
         deadline = self._deadline(timeout_s)
-        await self._servers.check_ports()
         while deadline.ends_within(0) or not await self.is_ready(
             timeout_s=min(PROBE_TIMEOUT_S, deadline.remaining_s())
         ):

@@ -135,9 +135,7 @@ class ProcessEndedError(ServerUnavailableError):
 
 
 class DeadlineExceededError(ServerError, TimeoutError):
-    """No answer came within the caller's time limit. server: the URL, and its proxy; empty: unknown."""
-
-    server = ""
+    """No answer came within the caller's time limit."""
 
 
 class ModelNotFoundError(ServerError):

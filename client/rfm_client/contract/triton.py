@@ -11,9 +11,9 @@ import os
 import re
 from collections.abc import Callable, Collection
 from typing import Any, TypeAlias, TypeVar
-from urllib.parse import urljoin
 
 from rfm_client.contract import errors
+from rfm_client.contract.addresses import grpc_proxy
 from rfm_client.contract.wire import GOAL, NUM_FRAMES, SECOND_FRAMES, VIEWS, frames_name
 
 BadRequest: TypeAlias = Callable[[str], errors.RewardError]
@@ -25,8 +25,6 @@ BAD_GATEWAY = ("502",)  # a proxy's connection to the server ended or was refuse
 DENIED = ("StatusCode.UNAUTHENTICATED", "StatusCode.PERMISSION_DENIED", "401", "403")
 
 _ServerError = TypeVar("_ServerError", bound=errors.ServerError)
-
-_REDIRECTS = range(300, 400)
 
 _ERRORS: dict[tuple[str, ...], type[errors.RewardError]] = {
     ("StatusCode.INVALID_ARGUMENT", "400"): errors.InvalidSampleError,
@@ -48,6 +46,7 @@ _NO_CONNECTION = re.compile(  # gRPC's own messages: nothing was sent
     "failed to connect|connections to all backends failing|errors resolving|resolution failed"
 )
 _REASON = re.compile(r"(?:: |\[)((?:Connection|Domain name|Name|No route|Network)[\w ]+)\]?$")  # from libc or gRPC
+_NO_GRPC = re.compile("Failed parsing HTTP/2|http1")  # another protocol's answer
 _PROXY_ALONE = "http2 header with status: 502"  # a proxy answered, but the server behind it did not
 _LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # or a proxy's
 _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|{RESTRICTED}")
@@ -74,11 +73,11 @@ _FIELDS = re.compile(r"(\S+): expected (.*?), got (.*)", re.DOTALL)  # as writte
 _PREFIX = re.compile(r"^(\[request id: [^\]]*\] )?(in ensemble '[^']*', )?")  # the caller knows both
 
 FEWER_FRAMES = "score some of them (subsample=True), each on few before it (frame_steps), or by a sampling rule"
-_START = "start the server there (rfm serve), or give the URL of one that runs"
-_NO_PROXY = "unset that variable, or add the server's host to no_proxy"
+_START = "start the server there (rfm serve), or give the URL of one that runs (with TLS grpcs:// or https://)"
 _NAME = "give the checkpoint's name with model (--model)"
 _SHOW_KEY = "show the key that it wants with api_key (--api-key-file) or headers"
 _TRUST = {
+    "WRONG_VERSION_NUMBER": "use grpc:// or http:// for a server without TLS",
     "[Hh]ostname|IP address mismatch": "use a host name in the URL that its certificate has",
     "expired|not yet valid": "renew its certificate, or set the clock",
     "(?i)verify.failed": "name its authority, or its self-signed certificate itself, with ca_file (--ca-file)",
@@ -99,31 +98,24 @@ def invalid_sample(text: str) -> errors.InvalidSampleError:
     return errors.InvalidSampleError.at(where, expected, got, FEWER_FRAMES if has_too_many else "")
 
 
-def error_from(
-    raised: Exception,
-    url: str,
-    *,
-    proxy: str | None = None,
-    bad_request: BadRequest = invalid_sample,
-) -> errors.RewardError | None:
+def error_from(raised: Exception, url: str, bad_request: BadRequest = invalid_sample) -> errors.RewardError | None:
     """Translate an exception from tritonclient or a library below it; None: any other exception.
 
-    proxy: the call's proxy (``grpc_proxy``)
     bad_request: makes the error for the status INVALID_ARGUMENT, which Triton also gives for an unknown model
     """
-    where = f"{url} through {proxy}" if proxy else url
     for kind in type(raised).__mro__:  # by name, because these libraries may not be imported
         match kind.__name__:
             case "InferenceServerException":
-                return _error_of_answer(raised, url, proxy, bad_request)
+                return _error_of_answer(raised, url, bad_request)
             case "TimeoutError":  # in Python 3.10 asyncio has its own class
-                late = errors.DeadlineExceededError(f"{where}: no answer in time")
-                late.server = where
-                return late
+                return errors.DeadlineExceededError(f"{url}: no answer in time")
             case "SSLError" | "ClientSSLError":
                 return denied(url, "", str(raised))
             case "ClientResponseError":
-                return errors.InferenceFailedError(f"{url}: no answer of an HTTP server: {type(raised).__name__}")
+                return errors.InferenceFailedError(
+                    f"{url}: expected an answer of Triton's HTTP port (by default 8000), got {type(raised).__name__}; "
+                    "use grpc:// for its gRPC port"
+                )
             case "ClientConnectorError" | "OSError" | "EOFError" | "HTTPException":
                 number = getattr(raised, "errno", None) or 0
                 return unreachable(url, os.strerror(number) if number > 0 else str(raised) or type(raised).__name__)
@@ -136,12 +128,17 @@ def error_from(
     return None
 
 
-def _error_of_answer(answer: Any, url: str, proxy: str | None, bad_request: BadRequest) -> errors.RewardError:
+def _error_of_answer(answer: Any, url: str, bad_request: BadRequest) -> errors.RewardError:
     status, message = str(answer.status()), answer.message() or ""
     if is_denied(status, message):
         return denied(url, status, message)
+    if status == "StatusCode.UNAVAILABLE" and _NO_GRPC.search(message):
+        return errors.InferenceFailedError(
+            f"{url}: expected an answer of Triton's gRPC port (by default 8001), got one that is not gRPC's; "
+            "use http:// for its HTTP port"
+        )
     if status == "StatusCode.UNAVAILABLE" and (_NO_CONNECTION.search(message) or _PROXY_ALONE in message):
-        return unreachable(url, message, proxy)
+        return unreachable(url, message)
     return error_of(status, message, bad_request)
 
 
@@ -167,20 +164,6 @@ def error_of(status: str, message: str, bad_request: BadRequest) -> errors.Rewar
     return error
 
 
-def is_redirect(status: int) -> bool:
-    """True for an HTTP status that names another address."""
-    return status in _REDIRECTS
-
-
-def redirected(url: str, location: str) -> errors.InferenceFailedError:
-    """Return the error for a redirect, which no call follows. location: from the answer's header."""
-    target = urljoin(url, location)
-    return errors.InferenceFailedError(
-        f"{url}: expected an answer of Triton, got a redirect to {target!r:.200}: give that server's address as URL if "
-        "you trust it"
-    )
-
-
 def is_denied(status: str, message: str) -> bool:
     """True if one side refused the other: a missing or wrong key, or an untrusted certificate."""
     return status in DENIED or (status == "StatusCode.UNAVAILABLE" and _NO_TRUST.search(message) is not None)
@@ -194,14 +177,13 @@ def denied(url: str, status: str, message: str) -> errors.AccessDeniedError:
     return _with_remedy(errors.AccessDeniedError, f"{url}: access denied: {message}", remedy)
 
 
-def unreachable(url: str, reason: str, proxy: str | None = None) -> errors.ServerUnavailableError:
+def unreachable(url: str, reason: str) -> errors.ServerUnavailableError:
     """Return the error for a failed connection to the server or its proxy."""
     found = _REASON.search(reason)
-    reason = found[1] if found else reason
-    if proxy is None:
-        return _with_remedy(errors.ServerUnavailableError, f"{url}: no connection: {reason}", _START)
-    fault = f"{url}: no connection through {proxy}: {reason}"
-    return _with_remedy(errors.ServerUnavailableError, fault, _NO_PROXY)
+    remedy = _START
+    if proxy := grpc_proxy(url):
+        remedy += f"; or add the host to no_proxy, unless {proxy} names the proxy that leads to it"
+    return _with_remedy(errors.ServerUnavailableError, f"{url}: no connection: {found[1] if found else reason}", remedy)
 
 
 def not_served(model: str, message: str, served: Collection[str]) -> errors.ModelNotFoundError:

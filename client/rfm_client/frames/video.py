@@ -21,7 +21,7 @@ from rfm_client.contract.addresses import open_url
 from rfm_client.contract.checks import checked_finite, checked_positive, require
 from rfm_client.contract.errors import InvalidSampleError, InvalidValueError
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.pictures import FrameFileError, decoded_picture, opened_picture
+from rfm_client.frames.pictures import FrameFileError
 from rfm_client.frames.video_decoding import (
     DAMAGED,
     DOWNLOAD,
@@ -29,7 +29,6 @@ from rfm_client.frames.video_decoding import (
     Packets,
     Upright,
     check_is_one_episode,
-    check_upright,
     import_av,
     judged,
     read_packets,
@@ -47,9 +46,6 @@ _LOST = (
 )
 _REMUX = "extract the stream and encode it: ffmpeg -i IN -c copy RAW.h264; ffmpeg -framerate FPS -i RAW.h264 OUT.mp4"
 _RGB_BYTES = 3  # bytes per pixel
-_PICTURES = (b"\xff\xd8\xff", b"\x89PNG", b"RIFF", b"II*\0", b"MM\0*")  # first bytes: JPEG, PNG, WebP, TIFF
-_ANIMATED_WEBP = "webp_anim"  # FFmpeg's format, known to PyAV 19; before, it is one webp_pipe packet
-_WITH_PREVIEWS = "MPO"  # Pillow's name for a JPEG file with further, smaller pictures
 
 
 def frame_indices(total: int, native_fps: float, fps: float) -> npt.NDArray[np.int64]:
@@ -81,8 +77,7 @@ def read_video(
 
     Frames are counted, not timed: at a variable frame rate, T follows the average rate, and frames are evenly spaced in
     number, not in time. Colours equal ``ffmpeg -pix_fmt rgb24`` with any PyAV. Frames are turned and mirrored as the
-    file says. A picture counts as a one-frame video. Only the returned frames stay in memory. A URL is downloaded
-    once, to a temporary file.
+    file says. Only the returned frames stay in memory. A URL is downloaded once, to a temporary file.
 
     start_s, end_s: part from ``start_s`` to before ``end_s``, in seconds since the first frame;
         None: from the start, to the end
@@ -103,10 +98,6 @@ def read_video(
             check_is_one_episode(source)
         with _opened(source, timeout_s) as file:
             is_part = (start_s, end_s) != (None, None)
-            picture = None if is_part or container is not None else _still(file)
-            if picture is not None:
-                return picture[np.newaxis]
-            check_upright(file)
             packets = read_packets(file, container)
             if not packets.fps and (is_part or fps is not None):
                 raise FrameFileError.of("a frame rate", "none")
@@ -144,7 +135,7 @@ def _errors_of(source: str | Path) -> Iterator[None]:
         raise InvalidSampleError.like(error, where="video", source=str(source)) from error
     except InvalidSampleError as error:
         raise InvalidSampleError.like(error, source=str(source)) from error
-    except (import_av().FFmpegError, OSError) as error:
+    except (import_av().FFmpegError, OSError, ValueError) as error:
         located = InvalidSampleError.at("video", _EXPECTED, _read_instead(error))
         if isinstance(error, FileNotFoundError):
             located = InvalidSampleError.at("video", "a video file", "no file of this name")
@@ -186,25 +177,6 @@ def _opened(source: str | Path, timeout_s: float) -> Iterator[BinaryIO]:
     with TemporaryFile() as copy:  # read twice, and an MP4's index may be at its end
         _download(str(source), copy, timeout_s)
         yield copy
-
-
-def _still(file: BinaryIO) -> UInt8Array | None:
-    """Return uint8 [H, W, 3], a single picture, upright by EXIF, which only some PyAV versions read; None: a video."""
-    beginning = file.read(max(map(len, _PICTURES)))
-    file.seek(0)
-    if not beginning.startswith(_PICTURES):
-        return None
-    with import_av().open(file) as opened:  # a picture stream has another format, or several packets
-        is_still = opened.format.name.endswith("_pipe") and sum(packet.size > 0 for packet in opened.demux()) == 1
-        is_still |= opened.format.name == _ANIMATED_WEBP
-    file.seek(0)
-    if not is_still:
-        return None
-    picture = opened_picture(file.read())
-    num_pictures = 1 if picture.format == _WITH_PREVIEWS else getattr(picture, "n_frames", 1)
-    if num_pictures > 1:
-        raise FrameFileError.of("a video, or a single picture", f"{num_pictures} pictures in a {picture.format} file")
-    return decoded_picture(picture)
 
 
 def _download(url: str, file: BinaryIO, timeout_s: float) -> None:

@@ -23,7 +23,6 @@ from rfm_client.frames.video_decoding import (
     Packets,
     Upright,
     check_is_one_episode,
-    check_upright,
     decoder,
     import_av,
     judged,
@@ -58,7 +57,6 @@ class Video:
         av = import_av()
         try:
             with self.file.open("rb") as opened:
-                check_upright(opened)
                 return read_packets(opened, self.container)
         except FileNotFoundError as error:
             raise FrameFileError.of("a video file", "none") from error

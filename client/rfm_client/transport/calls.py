@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import logging
 import os
 from collections.abc import Awaitable, Callable, Collection, Mapping
 from contextlib import nullcontext, suppress
@@ -13,14 +11,14 @@ from functools import cached_property, partial
 from importlib import import_module
 from typing import Any, ClassVar, Protocol, TypeVar
 
-from tritonclient.utils import InferenceServerException, np_to_triton_dtype
+from tritonclient.utils import np_to_triton_dtype
 
 from rfm_client.contract import errors, triton
-from rfm_client.contract.addresses import grpc_proxy, split_url
+from rfm_client.contract.addresses import split_url
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.wire import Tensors
-from rfm_client.transport.connection import SECURE_SCHEMES, Connection, Credentials, grpc_options
+from rfm_client.transport.connection import SECURE_SCHEMES, Credentials, grpc_options
 from rfm_client.transport.limits import check_size, timeout
 from rfm_client.transport.shared_memory import Region, SharedMemory
 from rfm_client.transport.threads import off_loop
@@ -29,8 +27,6 @@ Answered = TypeVar("Answered")
 
 _US_PER_S = 1_000_000
 _SERVED_TIMEOUT_S = 2.0  # for listing served models in an error
-
-logger = logging.getLogger("rfm_client")
 
 
 @dataclass(frozen=True)
@@ -80,7 +76,6 @@ class TritonTransport:
 
     _module: ClassVar[str]  # tritonclient's module with InferInput and InferRequestedOutput
     as_json: ClassVar[dict[str, bool]] = {}  # makes the client's methods return dictionaries
-    _proxy: str | None = None  # for errors
 
     def __init__(self, url: str, credentials: Credentials, *, shared_memory: bool) -> None:
         self.url = url
@@ -89,8 +84,7 @@ class TritonTransport:
         if credentials.uses_tls and self._scheme not in SECURE_SCHEMES:
             raise InvalidValueError.at("url", "grpcs:// or https:// with certificates", url)
         self._shared_memory = SharedMemory(url) if shared_memory else None
-        self._connection: Connection | None = None
-        self._left: list[Connection] = []  # may not be closed yet
+        self._client: Any = None  # tritonclient's
 
     @cached_property
     def _triton(self) -> Any:
@@ -100,36 +94,31 @@ class TritonTransport:
         self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
     ) -> Answer:
         request = partial(self._infer, model, inputs, outputs, request_id, timeout_s)
-        return await self._call(model, request, timeout_s)
+        return await self.call(request, timeout_s, model=model)
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
         async def request(client: Any) -> ModelInfo:
             config = await client.get_model_config(model, **self.as_json)
             return ModelInfo.from_config(config.get("config", config))  # nested in gRPC's answer
 
-        return await self._call(model, request, timeout_s, bad_request=errors.ModelNotFoundError)
+        return await self.call(request, timeout_s, model=model, bad_request=errors.ModelNotFoundError)
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
         async def request(client: Any) -> bool:
             return bool(await client.is_server_ready() and await client.is_model_ready(model))
 
         try:
-            return await self._call(model, request, timeout_s)
+            return await self.call(request, timeout_s)
         except errors.ServerError:
             return False
-
-    async def ask(self, request: Callable[[Any], Awaitable[Answered]], timeout_s: float) -> Answered:
-        """Return what ``request`` gets from tritonclient's client. Raises RewardError."""
-        return await self._call("", request, timeout_s)
 
     async def close(self) -> None:
         try:
             if self._shared_memory is not None:
-                with self._connected().used() as client:
-                    await self._shared_memory.close(client)
+                await self._shared_memory.close(self._connected())
         finally:
-            for connection in (*self._left, *filter(None, [self._connection])):
-                await connection.close()
+            if self._client is not None:
+                await self._client.close()
 
     async def _infer(
         self, model: str, inputs: Tensors, outputs: Collection[str], request_id: str, timeout_s: float, client: Any
@@ -160,23 +149,27 @@ class TritonTransport:
             tensors.append(tensor)
         return tensors
 
-    async def _call(
+    async def call(
         self,
-        model: str,
         request: Callable[[Any], Awaitable[Answered]],
         timeout_s: float,
         *,
+        model: str = "",
         bad_request: triton.BadRequest = triton.invalid_sample,
     ) -> Answered:
-        """Return the answer to ``request`` within ``timeout_s``; ``bad_request`` as in ``triton.error_from``."""
+        """Return what ``request`` gets from tritonclient's client. Raises RewardError.
+
+        model: named in the error for a missing model
+        bad_request: as in ``triton.error_from``
+        """
         try:
             # One limit for gRPC and HTTP. Triton drops a cancelled gRPC call, unless scoring has begun.
             async with timeout(timeout_s):
-                return await self._answer(request)
+                return await request(self._connected())
         except errors.RewardError:
             raise
         except Exception as raised:
-            error = triton.error_from(raised, self.url, proxy=self._proxy, bad_request=bad_request)
+            error = triton.error_from(raised, self.url, bad_request)
             if error is None:
                 raise
             if isinstance(error, errors.ModelNotFoundError):
@@ -187,35 +180,15 @@ class TritonTransport:
         """Return the error with the served models' names, if the server lists them in time."""
         with suppress(Exception):
             async with timeout(_SERVED_TIMEOUT_S):
-                with self._connected().used() as client:
-                    statistics = await client.get_inference_statistics(**self.as_json)
-                    served = {each["name"] for each in statistics.get("model_stats", [])}
-                    return triton.not_served(model, error.message, served)
+                statistics = await self._connected().get_inference_statistics(**self.as_json)
+                served = {each["name"] for each in statistics.get("model_stats", [])}
+                return triton.not_served(model, error.message, served)
         return error
 
-    async def _answer(self, request: Callable[[Any], Awaitable[Answered]]) -> Answered:
-        """Return the answer. If the call is cancelled on a silent connection, later calls get a new connection."""
-        connection = self._connected()
-        try:
-            with connection.used() as client:
-                answer = await request(client)
-            connection.record_answer()
-            return answer
-        except InferenceServerException:
-            connection.record_answer()  # or gRPC has noticed that the connection ended
-            raise
-        except asyncio.CancelledError:
-            if connection.is_silent and connection is self._connection:
-                logger.info("%s: nothing comes over the connection: the next call gets a new one", self.url)
-                self._connection = None
-                self._left = [*(left for left in self._left if not left.is_closed), connection]
-                connection.leave()
-            raise
-
-    def _connected(self) -> Connection:
-        if self._connection is None:
-            self._connection = Connection(self._open())
-        return self._connection
+    def _connected(self) -> Any:
+        if self._client is None:
+            self._client = self._open()
+        return self._client
 
     def _open(self) -> Any:
         """Return a client with tritonclient's methods. It connects at first use and sends the credentials."""
@@ -231,10 +204,6 @@ class GrpcTransport(TritonTransport):
     _module = "tritonclient.grpc.aio"
     as_json: ClassVar[dict[str, bool]] = {"as_json": True}
     _first_process: int | None = None  # the first process that used gRPC
-
-    def __init__(self, url: str, credentials: Credentials, *, shared_memory: bool) -> None:
-        super().__init__(url, credentials, shared_memory=shared_memory)
-        self._proxy = grpc_proxy(self._address)
 
     def _open(self) -> Any:
         process = GrpcTransport._first_process = GrpcTransport._first_process or os.getpid()

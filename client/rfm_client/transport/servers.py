@@ -36,8 +36,7 @@ from rfm_client.contract.errors import (
     clear_variables,
 )
 from rfm_client.contract.wire import Tensors
-from rfm_client.transport.calls import Answer, Transport, TritonTransport
-from rfm_client.transport.connection import WRONG_PORT_ERRORS, wrong_port
+from rfm_client.transport.calls import Answer, Transport
 from rfm_client.transport.limits import Deadline
 
 Answered = TypeVar("Answered")
@@ -58,7 +57,6 @@ class KnownServer:
     """One of several servers: transport, load and failures.
 
     failures: how often the server was left out since the last success
-    has_answered: True after the first success
     comeback: ends when the server reports ready again; None: never left out
     """
 
@@ -67,7 +65,6 @@ class KnownServer:
         self.outstanding = 0
         self.last_request = 0
         self.failures = 0
-        self.has_answered = False
         self.comeback: asyncio.Task[None] | None = None
 
     @property
@@ -189,12 +186,6 @@ class Servers:
             for probe in probes:
                 probe.cancel()
 
-    async def check_ports(self) -> None:
-        """Raise ServerUnavailableError if all URLs have a wrong port: waiting would not help."""
-        named = await self._wrong_ports()
-        if named and named[0] is not None and all(named):
-            raise ServerUnavailableError(named[0])
-
     def stop_retrying(self) -> None:
         """Let later failures end their calls at once, without a message in the log."""
         self._retry = False
@@ -216,9 +207,6 @@ class Servers:
             clear_variables(error)
             if self._is_closed and not _is_task_cancelled():  # closing connections raise errors from many classes
                 raise ClientClosedError("this client was closed during the call") from error
-            if isinstance(error, WRONG_PORT_ERRORS) and not any(server.has_answered for server in self._servers):
-                for named in filter(None, await self._wrong_ports()):
-                    raise ServerUnavailableError(named) from error
             raise
 
     async def _until_answered(
@@ -238,7 +226,7 @@ class Servers:
                 failed = failures.get(server)
                 if failed is not None and left_s < deadline.timeout_s / 2:
                     raise failed from failed.__cause__  # this failure took most of the time
-                raise deadline.exceeded(error.server or server.transport.url) from error
+                raise deadline.exceeded(server.transport.url) from error
             except (AccessDeniedError, InferenceFailedError, ModelNotFoundError) as error:
                 refusals[server] = error
                 if not self._retry:
@@ -268,7 +256,7 @@ class Servers:
                 if deadline.ends_within(0):  # the pause took longer than planned
                     raise
             else:
-                server.failures, server.has_answered = 0, True
+                server.failures = 0
                 for other, refusal in refusals.items():  # not before: if all refuse, no server is at fault
                     self._leave_out(other, model, refusal)
                 return answer
@@ -294,11 +282,6 @@ class Servers:
             server.comeback = asyncio.create_task(server.back(model, was_down=was_down))
         elif len(self._servers) > 1:
             server.comeback = asyncio.create_task(server.rested(model))
-
-    async def _wrong_ports(self) -> list[str | None]:
-        """Return what is wrong with each server's port; None: no fault found."""
-        ours = [server.transport.url for server in self._servers if isinstance(server.transport, TritonTransport)]
-        return [await asyncio.to_thread(wrong_port, url) for url in ours]
 
 
 def _is_task_cancelled() -> bool:
