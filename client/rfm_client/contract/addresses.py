@@ -25,9 +25,8 @@ from rfm_client.contract.settings import ConfigError
 MAX_PORT = 65535
 
 _URL = re.compile(
-    r"((?P<scheme>grpcs?|https?)://|dns:///)(?P<address>(\[[\da-fA-F:.]+(%\w+)?\]|[^][:/@\s]+):(?P<port>\d{1,5}))/?"
+    r"(?P<scheme>grpcs?|https?)://(?P<address>(\[[\da-fA-F:.]+(%\w+)?\]|[^][:/@\s]+):(?P<port>\d{1,5}))/?"
 )
-_PORTS = {"grpc": 8001, "http": 8000}
 _OPENSSL_REASONS = {
     "NO_CERTIFICATE_OR_CRL_FOUND": "a file without certificate",
     "KEY_VALUES_MISMATCH": "the key of another certificate",
@@ -39,16 +38,13 @@ _OPENSSL_REASONS = {
 def split_url(url: str) -> tuple[str, str]:
     """Return a URL's scheme (``grpc``, ``http``, ``grpcs`` or ``https``) and ``host:port``. Raises ValueError.
 
-    ``dns:///host:port``, gRPC's own form, means ``grpc://host:port``. An IPv6 address needs brackets.
+    An IPv6 address needs brackets.
     """
-    scheme, _, address = url.rstrip("/").partition("://")
-    for host, port in (address.rpartition(":")[::2], (address, str(_PORTS.get(scheme.removesuffix("s"), 8000)))):
-        if _is_ipv6(host):
-            raise InvalidValueError.at("url", f"brackets around an IPv6 address, {scheme}://[{host}]:{port}", repr(url))
     match = _URL.fullmatch(url)
     if match is None or int(match["port"]) > MAX_PORT:
-        raise InvalidValueError.at("url", "grpc://host:port or http://host:port, or grpcs:// or https://", repr(url))
-    return match["scheme"] or "grpc", match["address"]
+        expected = "grpc://host:port or http://host:port, or grpcs:// or https:// (brackets around an IPv6 address)"
+        raise InvalidValueError.at("url", expected, repr(url))
+    return match["scheme"], match["address"]
 
 
 def host_of(address: str) -> str:
@@ -62,13 +58,6 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host.lower() == "localhost"
-
-
-def _is_ipv6(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).version == 6
-    except ValueError:
-        return False
 
 
 def check_certificate(certificate: str | Path, key: str | Path, where: str) -> None:

@@ -67,7 +67,7 @@ class HttpClient(InferenceServerClient):  # type: ignore[misc]  # untyped
         return answer
 
 
-def _error(url: str, status: int, content: bytes) -> Exception:
+def _error(url: str, status: int, content: bytes) -> Any:
     """Return the error with Triton's reason; otherwise with the answer's text, which may be a proxy's."""
     try:
         reason = str(json.loads(content)["error"])
