@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
-from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import numpy.typing as npt
@@ -160,12 +159,9 @@ def _check_kind(file: BinaryIO) -> None:
         raise FrameFileError.of("a whole video file", f"one that ends inside a picture, after {num_bytes} bytes")
 
 
-def check_is_one_episode(source: str | Path) -> None:
-    """Raise InvalidSampleError for a path or URL in LeRobot v3.0's layout, where files hold several episodes."""
-    if isinstance(source, Path) or "://" not in source:
-        paths = [Path(source).absolute().as_posix(), Path(source).resolve().as_posix()]  # a download may be a link
-    else:
-        paths = [unquote(urlsplit(source).path)]
+def check_is_one_episode(file: Path) -> None:
+    """Raise InvalidSampleError for a file in LeRobot v3.0's layout, where files hold several episodes."""
+    paths = [file.absolute().as_posix(), file.resolve().as_posix()]  # a download may be a link
     if any(map(_SHARED_FILE.search, paths)):
         raise InvalidSampleError.at("video", "a video of one episode", _SEVERAL_EPISODES)
 

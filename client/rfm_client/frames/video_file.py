@@ -54,19 +54,18 @@ class Video:
     @cached_property
     def packets(self) -> Packets:
         """The packets, read without decoding. Raises FrameFileError for a broken file, or several videos in it."""
-        av = import_av()
         try:
             with self.file.open("rb") as opened:
                 return read_packets(opened, self.container)
         except FileNotFoundError as error:
             raise FrameFileError.of("a video file", "none") from error
-        except (av.FFmpegError, OSError) as error:
+        except (import_av().FFmpegError, OSError) as error:
             raise FrameFileError.of("a whole video file", error.strerror or error) from error
 
     @contextmanager
     def opened(self) -> Iterator[tuple[Any, Any]]:
         """Yield the file as opened by PyAV, and its only video stream. Raises FrameFileError and PyAV's errors."""
-        with import_av().open(str(self.file), format=self.container) as container:
+        with import_av().open(str(self.file.absolute()), format=self.container) as container:
             # with PyAV's default threading: thread_type AUTO loses some damage marks
             yield container, video_stream(container)
 
