@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.checks import require
-from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.errors import InvalidSampleError, InvalidValueError, LocatedError
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
 UInt8Array: TypeAlias = npt.NDArray[np.uint8]
@@ -248,11 +248,13 @@ def as_array(values: Any) -> npt.NDArray[Any]:
     return np.asarray(values)
 
 
-def checked_mask(where: str, mask: npt.ArrayLike, count: int) -> npt.NDArray[np.bool_]:
-    """Return a mask, bool [count], given as an array, list or tensor. Raises ValueError."""
+def checked_mask(
+    where: str, mask: npt.ArrayLike, count: int, error: type[LocatedError] = InvalidValueError
+) -> npt.NDArray[np.bool_]:
+    """Return a mask, bool [count], given as an array, list or tensor. Raises ``error``."""
     array = as_array(mask)
     is_mask = array.dtype == np.bool_ and array.shape == (count,)
-    require(where, is_mask, f"bool [{count}]", f"{array.dtype} {list(array.shape)}")
+    require(where, is_mask, f"bool [{count}]", f"{array.dtype} {list(array.shape)}", error)
     return array
 
 

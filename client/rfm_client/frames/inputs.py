@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from rfm_client.contract.checks import git_lfs_pointer, require
 from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.contract.samples import Trajectory, UInt8Array, as_array, with_pictures
+from rfm_client.contract.samples import Trajectory, UInt8Array, as_array, checked_mask, with_pictures
 from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
 from rfm_client.frames.pictures import FrameFileError, Picture, upright_picture
 from rfm_client.frames.video import read_video
@@ -139,11 +139,8 @@ def _unpadded(columns: Mapping[str, Any], key: str, values: Any) -> Any:
     """Return the values [T, ...] at the steps that are not padding. Without marks, return them unchanged."""
     if key + _IS_PAD not in columns or values is None:
         return values
-    steps, padding = as_array(values), as_array(columns[key + _IS_PAD])
-    is_of_steps = padding.dtype == bool and padding.shape == steps.shape[:1]
-    expected, got = f"bool {list(steps.shape[:1])}", f"{padding.dtype} {list(padding.shape)}"
-    require(key + _IS_PAD, is_of_steps, expected, got, InvalidSampleError)
-    return steps[~padding]
+    steps = as_array(values)
+    return steps[~checked_mask(key + _IS_PAD, columns[key + _IS_PAD], len(steps), InvalidSampleError)]
 
 
 def _corrected(trajectory: Trajectory, correction: Correction) -> Trajectory:

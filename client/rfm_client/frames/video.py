@@ -23,7 +23,6 @@ from rfm_client.frames.video_decoding import (
     UNDAMAGED,
     Packets,
     Upright,
-    check_is_one_episode,
     import_av,
     judged,
 )
@@ -68,9 +67,9 @@ def read_video(
     _check_numbers(fps, start_s, end_s)
     take = take or (lambda num_bytes: None)
     with _errors_of(file):
-        if start_s is None or end_s is None:
-            check_is_one_episode(Path(file))
         video = Video(Path(file), container)
+        if start_s is None or end_s is None:
+            video.check_is_one_episode()
         is_part = (start_s, end_s) != (None, None)
         if not video.packets.fps and (is_part or fps is not None):
             raise FrameFileError.of("a frame rate", "none")

@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.checks import git_lfs_pointer
-from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.frames.pictures import FrameFileError
 
@@ -35,12 +32,6 @@ _TS_SYNC, _TS_PACKETS = 0x47, ((188, 0), (192, 4))  # first byte, its offset by 
 _PICTURES = (b"\xff\xd8\xff", b"\x89PNG", b"II*\0", b"MM\0*")  # first bytes: JPEG, PNG, TIFF
 _WEBP = slice(8, 12)  # where a WebP file says so
 _HEAD_BYTES = 1024  # enough to recognise MPEG-TS packets, or a GIF's padding
-_SEVERAL_EPISODES = (
-    "a file in the layout of LeRobot v3.0, which holds several: label the dataset with rfm-client label, or name a "
-    "part: start_s and end_s of load_trajectory, in seconds since the file's first frame (from_timestamp in "
-    "meta/episodes, and length / fps later)"
-)
-_SHARED_FILE = re.compile(r"/videos/[^/]+/chunk-\d+/file-\d+\.\w+$")  # holds several episodes, in LeRobot v3.0
 _NEARLY = math.tan(math.radians(1))  # FFmpeg's tolerance for quarter turns in a display matrix
 
 
@@ -51,14 +42,6 @@ def import_av() -> Any:
     except ImportError as error:
         raise ImportError('video files need PyAV: pip install "./client[video]"') from error
     return av
-
-
-def decoder() -> str:
-    """Return the versions of PyAV and its libraries that determine decoded pixels."""
-    av = import_av()
-    names = ("libswscale", "libavcodec", "libavfilter")
-    libraries = (f"{name} {'.'.join(map(str, av.library_versions[name]))}" for name in names)
-    return f"PyAV {av.__version__}, {', '.join(libraries)}"
 
 
 def video_stream(container: Any) -> Any:
@@ -157,13 +140,6 @@ def _check_kind(file: BinaryIO) -> None:
         is_cut |= len(syncs) > 3 and set(syncs) == {_TS_SYNC} and num_bytes % length != 0
     if is_cut:
         raise FrameFileError.of("a whole video file", f"one that ends inside a picture, after {num_bytes} bytes")
-
-
-def check_is_one_episode(file: Path) -> None:
-    """Raise InvalidSampleError for a file in LeRobot v3.0's layout, where files hold several episodes."""
-    paths = [file.absolute().as_posix(), file.resolve().as_posix()]  # a download may be a link
-    if any(map(_SHARED_FILE.search, paths)):
-        raise InvalidSampleError.at("video", "a video of one episode", _SEVERAL_EPISODES)
 
 
 class Upright:

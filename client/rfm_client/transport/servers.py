@@ -81,20 +81,9 @@ class KnownServer:
         finally:
             self.outstanding -= 1
 
-    async def rested(self, model: str) -> None:
-        """Pause, longer after each failure, then wait until the server reports ready."""
-        await asyncio.sleep(pause_s(self.failures - 1, LONGEST_REST_S))
-        for attempt in itertools.count():
-            if await self.transport.is_ready(model, PROBE_TIMEOUT_S):
-                return
-            await asyncio.sleep(pause_s(attempt, LONGEST_PAUSE_S))
-
-    async def back(self, model: str, *, was_down: bool) -> None:
-        """Wait until the server is ready again after a process or the connection ended.
-
-        Triton 2.51 reports a dead model as ready. So wait for RESTART_S, or until the server has reported not ready.
-        """
-        until_s = time.monotonic() + RESTART_S
+    async def back(self, model: str, rest_s: float) -> None:
+        """Wait until the server is ready after ``rest_s``, or ready after it has reported not ready."""
+        until_s, was_down = time.monotonic() + rest_s, False
         while True:
             is_ready = await self.transport.is_ready(model, PROBE_TIMEOUT_S)
             if is_ready and (was_down or time.monotonic() >= until_s):
@@ -277,11 +266,15 @@ class Servers:
         if server.is_left_out or self._is_closed:
             return  # the same failure, or closing
         server.failures += 1
-        if error.may_have_ended_server:
-            was_down = not isinstance(error, ProcessEndedError)
-            server.comeback = asyncio.create_task(server.back(model, was_down=was_down))
+        if isinstance(error, ProcessEndedError):
+            rest_s = RESTART_S  # Triton 2.51 reports a dead model as ready
+        elif error.may_have_ended_server:
+            rest_s = 0.0
         elif len(self._servers) > 1:
-            server.comeback = asyncio.create_task(server.rested(model))
+            rest_s = pause_s(server.failures - 1, LONGEST_REST_S)
+        else:
+            return
+        server.comeback = asyncio.create_task(server.back(model, rest_s))
 
 
 def _is_task_cancelled() -> bool:
