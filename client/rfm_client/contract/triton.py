@@ -57,17 +57,16 @@ _NO_INPUT = re.compile(
     r"(?:expected (?:number of inputs between \d+ and )?\d+ (?:inputs )?but got .*|unexpected .*input )"
     rf"'(?P<name>{'|'.join((SECOND_FRAMES, *VIEWS, GOAL))})'"
 )
-_WITHOUT_VIEWS = (
+_OF_PAIRS = (  # a model that has the input, one that lacks it, and the remedy
+    "a model that takes pairs of two frame sizes",
+    "one that was exported before there was this input",
+    "export it again, or resize a trajectory",
+)
+_OF_VIEWS = (
     "a model that reads views and a goal, such as Robo-Dopamine",
     "one that reads the frames of one camera",
     "leave out views and goal",
 )
-_OLD = "one that was exported before there was this input"
-# By optional input: a model that has it, one that lacks it, and the remedy.
-_WITHOUT = {
-    SECOND_FRAMES: ("a model that takes pairs of two frame sizes", _OLD, "export it again, or resize a trajectory"),
-    **dict.fromkeys((*VIEWS, GOAL), _WITHOUT_VIEWS),
-}
 _NO_OUTPUT = re.compile(r"unexpected inference output '(\w+)'")
 _FIELDS = re.compile(r"(\S+): expected (.*?), got (.*)", re.DOTALL)  # as written by ``LocatedError``
 _PREFIX = re.compile(r"^(\[request id: [^\]]*\] )?(in ensemble '[^']*', )?")  # the caller knows both
@@ -150,8 +149,9 @@ def error_of(status: str, message: str, bad_request: BadRequest) -> errors.Rewar
         return errors.InvalidSampleError.at(shape["name"], f"[{shape['expected']}]", f"[{shape['got']}]")
     without = _NO_INPUT.search(text)
     if without is not None:
-        expected, got, remedy = _WITHOUT[without["name"]]
-        return errors.InvalidSampleError.at(without["name"], expected, got, remedy)
+        return errors.InvalidSampleError.at(
+            without["name"], *(_OF_PAIRS if without["name"] == SECOND_FRAMES else _OF_VIEWS)
+        )
     if PROCESS_ENDED in text and "Stub process" in text:
         return errors.ProcessEndedError(text)
     if LOST_REGION in text or f"has {NO_VERSIONS}" in text:  # the sample is not at fault: a retry may succeed
@@ -171,9 +171,9 @@ def is_denied(status: str, message: str) -> bool:
 
 def denied(url: str, status: str, message: str) -> errors.AccessDeniedError:
     """Return the error for a refused connection or request, with its remedy."""
-    is_keyed = status in DENIED or RESTRICTED in message
-    fitting = (remedy for words, remedy in _TRUST.items() if re.search(words, message))
-    remedy = _SHOW_KEY if is_keyed else next(fitting, "")
+    remedy = next((remedy for words, remedy in _TRUST.items() if re.search(words, message)), "")
+    if status in DENIED or RESTRICTED in message:
+        remedy = _SHOW_KEY
     return _with_remedy(errors.AccessDeniedError, f"{url}: access denied: {message}", remedy)
 
 

@@ -182,22 +182,12 @@ def _columns(steps: Iterable[Mapping[str, Any]]) -> Mapping[str, Any]:
 
 
 def _only(columns: Mapping[str, Any], key: str, default: Any) -> Any:
-    """Return the key's value, equal at all steps."""
-    values = _values(columns[key]) if key in columns else [default]
+    """Return the key's value, equal at all steps, given once or for each step, in any container."""
+    values = as_array(columns[key]).reshape(-1).tolist() if key in columns else [default]
     for value in values:
         got = f"{values[0]!r} and {value!r}"
         require(key, value == values[0], "the same at all steps", got, InvalidSampleError)
     return values[0] if values else default
-
-
-def _values(column: Any) -> list[Any]:
-    """Flatten a column: one value for all steps or one per step, in any container."""
-    if isinstance(column, str):
-        return [column]
-    if isinstance(column, Sequence):
-        return [value for part in column for value in _values(part)]
-    values: list[Any] = as_array(column).reshape(-1).tolist()
-    return values
 
 
 def _camera_key(columns: Mapping[str, Any], camera: str | None) -> str:

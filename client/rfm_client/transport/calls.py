@@ -7,7 +7,7 @@ import os
 from collections.abc import Awaitable, Callable, Collection, Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from importlib import import_module
 from typing import Any, ClassVar, Protocol, TypeVar
 
@@ -93,7 +93,23 @@ class TritonTransport:
     async def infer(
         self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
     ) -> Answer:
-        request = partial(self._infer, model, inputs, outputs, request_id, timeout_s)
+        requested = [self._triton.InferRequestedOutput(name) for name in outputs]
+        # If the export sets queue_timeout_ms, Triton drops requests that wait longer in its queue, over HTTP too.
+        waits_us = max(int(timeout_s * _US_PER_S), 1)
+        largest = max(inputs, key=lambda name: inputs[name].nbytes)
+
+        async def request(client: Any) -> Answer:
+            lent = nullcontext() if self._shared_memory is None else self._shared_memory.lend(client, inputs[largest])
+            async with lent as region:
+                regions = {largest: region} if region is not None else {}
+                check_size(inputs, regions)
+                num_bytes = 0 if regions else inputs[largest].nbytes
+                tensors = await off_loop(num_bytes, self._inputs, inputs, regions)
+                answer = await client.infer(model, tensors, outputs=requested, request_id=request_id, timeout=waits_us)
+            response = answer.get_response()
+            version = response["model_version"] if isinstance(response, dict) else response.model_version
+            return Answer(_outputs(answer, outputs), str(version))
+
         return await self.call(request, timeout_s, model=model)
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
@@ -119,24 +135,6 @@ class TritonTransport:
         finally:
             if self._client is not None:
                 await self._client.close()
-
-    async def _infer(
-        self, model: str, inputs: Tensors, outputs: Collection[str], request_id: str, timeout_s: float, client: Any
-    ) -> Answer:
-        requested = [self._triton.InferRequestedOutput(name) for name in outputs]
-        # If the export sets queue_timeout_ms, Triton drops requests that wait longer in its queue, over HTTP too.
-        waits_us = max(int(timeout_s * _US_PER_S), 1)
-        largest = max(inputs, key=lambda name: inputs[name].nbytes)
-        lent = nullcontext() if self._shared_memory is None else self._shared_memory.lend(client, inputs[largest])
-        async with lent as region:
-            regions = {largest: region} if region is not None else {}
-            check_size(inputs, regions)
-            num_bytes = 0 if regions else inputs[largest].nbytes
-            tensors = await off_loop(num_bytes, self._inputs, inputs, regions)
-            answer = await client.infer(model, tensors, outputs=requested, request_id=request_id, timeout=waits_us)
-        response = answer.get_response()
-        version = response["model_version"] if isinstance(response, dict) else response.model_version
-        return Answer(_outputs(answer, outputs), str(version))
 
     def _inputs(self, inputs: Tensors, regions: Mapping[str, Region]) -> list[Any]:
         tensors = []
