@@ -11,7 +11,7 @@ with RewardClient("grpc://localhost:8001") as client:
 import importlib
 import typing
 
-from rfm_client import contract
+from rfm_client import contract as _contract
 from rfm_client.contract import *  # noqa: F403
 from rfm_client.contract.samples import Float32Array, UInt8Array, as_array
 
@@ -21,7 +21,6 @@ if typing.TYPE_CHECKING:
     from rfm_client.frames.inputs import as_trajectory, load_trajectory
 
 __all__ = [
-    *contract.__all__,
     "AsyncRewardClient",
     "Float32Array",
     "RewardClient",
@@ -30,6 +29,7 @@ __all__ = [
     "as_trajectory",
     "load_trajectory",
 ]
+__all__ += _contract.__all__
 
 _LATER = {  # imported at first use, because servers need only the contract
     "AsyncRewardClient": "async_client",

@@ -41,7 +41,7 @@ from rfm_client.episodes.steps import Steps
 from rfm_client.frames.fit_to_checkpoint import resize_frames
 from rfm_client.frames.sampling import Sampling
 from rfm_client.scoring.samples import Call, CallOptions, SampleScorer, results_of
-from rfm_client.transport.calls import Transport, connect
+from rfm_client.transport.calls import Transport, TritonTransport
 from rfm_client.transport.connection import Credentials
 from rfm_client.transport.limits import ConcurrencyLimiter, Deadline, check_timeout
 from rfm_client.transport.servers import PROBE_TIMEOUT_S, Servers
@@ -115,7 +115,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         transports = self.transports
         if not transports:
             urls = [self.urls] if isinstance(self.urls, str) else self.urls
-            transports = [connect(url, shared_memory=self.shared_memory, credentials=credentials) for url in urls]
+            transports = [TritonTransport(url, credentials, shared_memory=self.shared_memory) for url in urls]
         self._servers = Servers(transports, retry=self.retry)
         self._scorer = SampleScorer(self.model, self._servers, ConcurrencyLimiter(self.max_in_flight))
         self._steps = StepScorer(self.model, self._scorer, len(self._servers))

@@ -57,38 +57,33 @@ class Transport(Protocol):
         """Close the connection to the server."""
 
 
-def connect(url: str, *, shared_memory: bool = False, credentials: Credentials | None = None) -> TritonTransport:
-    """Return the transport for ``grpc://host:port`` or ``http://host:port``, with TLS ``grpcs://`` or ``https://``.
+class TritonTransport:
+    """The transport for ``grpc://host:port`` or ``http://host:port``, with TLS ``grpcs://`` or ``https://``.
 
-    The transport connects at first use. Raises ValueError.
+    tritonclient is imported, and its client connects, at first use; the client belongs to the event loop that runs
+    then. Over gRPC a late or cancelled call is also cancelled on the server, unless scoring has begun; if the host name
+    has several addresses (a headless Service), gRPC spreads the requests over them. Over HTTP there is one connection
+    per concurrent call, and Triton finishes a request even if its caller has left. Raises ValueError.
 
     shared_memory: True: send large inputs through memory that the server, on the same host, also maps
     """
-    kind = GrpcTransport if split_url(url)[0].startswith("grpc") else HttpTransport
-    return kind(url, credentials or Credentials(), shared_memory=shared_memory)
 
+    _first_process: ClassVar[int | None] = None  # the first process that used gRPC
 
-class TritonTransport:
-    """Base class for gRPC and HTTP, whose asyncio clients differ only in a few options.
-
-    tritonclient's module is imported at first use. The client belongs to the event loop that runs then.
-    """
-
-    _module: ClassVar[str]  # tritonclient's module with InferInput and InferRequestedOutput
-    as_json: ClassVar[dict[str, bool]] = {}  # makes the client's methods return dictionaries
-
-    def __init__(self, url: str, credentials: Credentials, *, shared_memory: bool) -> None:
+    def __init__(self, url: str, credentials: Credentials | None = None, *, shared_memory: bool = False) -> None:
         self.url = url
         self._scheme, self._address = split_url(url)
-        self._credentials = credentials
-        if credentials.uses_tls and self._scheme not in SECURE_SCHEMES:
+        self._is_grpc = self._scheme.startswith("grpc")
+        self.as_json = {"as_json": True} if self._is_grpc else {}  # makes the client's methods return dictionaries
+        self._credentials = credentials or Credentials()
+        if self._credentials.uses_tls and self._scheme not in SECURE_SCHEMES:
             raise InvalidValueError.at("url", "grpcs:// or https:// with certificates", url)
         self._shared_memory = SharedMemory(url) if shared_memory else None
         self._client: Any = None  # tritonclient's
 
     @cached_property
     def _triton(self) -> Any:
-        return import_module(self._module)
+        return import_module("tritonclient.grpc.aio" if self._is_grpc else "tritonclient.http")
 
     async def infer(
         self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
@@ -190,21 +185,11 @@ class TritonTransport:
 
     def _open(self) -> Any:
         """Return a client with tritonclient's methods. It connects at first use and sends the credentials."""
-        raise NotImplementedError
+        if not self._is_grpc:
+            from rfm_client.transport.http import HttpClient
 
-
-class GrpcTransport(TritonTransport):
-    """gRPC transport: a late or cancelled call is also cancelled on the server, unless scoring has begun.
-
-    If the host name has several addresses (a headless Service), gRPC spreads the requests over them.
-    """
-
-    _module = "tritonclient.grpc.aio"
-    as_json: ClassVar[dict[str, bool]] = {"as_json": True}
-    _first_process: int | None = None  # the first process that used gRPC
-
-    def _open(self) -> Any:
-        process = GrpcTransport._first_process = GrpcTransport._first_process or os.getpid()
+            return HttpClient(self._scheme, self._address, self._credentials)
+        process = TritonTransport._first_process = TritonTransport._first_process or os.getpid()
         if process != os.getpid():  # gRPC would crash or hang
             raise RuntimeError(
                 f"gRPC was used in process {process}, which forked this one: "
@@ -215,17 +200,6 @@ class GrpcTransport(TritonTransport):
         )
         self._credentials.show_with_each_request(client)
         return client
-
-
-class HttpTransport(TritonTransport):
-    """HTTP transport: one connection per concurrent call. Triton finishes a request even if its caller has left."""
-
-    _module = "tritonclient.http"
-
-    def _open(self) -> Any:
-        from rfm_client.transport.http import HttpClient
-
-        return HttpClient(self._scheme, self._address, self._credentials)
 
 
 def _outputs(answer: Any, names: Collection[str]) -> Tensors:

@@ -20,7 +20,7 @@ from rfm_client.contract import triton
 from rfm_client.contract.addresses import open_url, split_url
 from rfm_client.contract.errors import DeadlineExceededError
 from rfm_client.contract.wire import encoder_name, frames_name
-from rfm_client.transport.calls import connect
+from rfm_client.transport.calls import TritonTransport
 from rfm_client.transport.connection import Credentials
 
 METRICS_PORT = 8002
@@ -195,7 +195,7 @@ class ServerStatus:
 
 async def _state(url: str, timeout_s: float, credentials: Credentials | None) -> _ServerState:
     """Return the server's version, whether it is ready, and every model's index entry and statistics."""
-    transport = connect(url, credentials=credentials)
+    transport = TritonTransport(url, credentials)
 
     async def request(client: Any) -> _ServerState:
         version = (await client.get_server_metadata(**transport.as_json))["version"]
