@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_args
 
+import av
 import numpy as np
 import pytest
 import torch
@@ -255,6 +256,26 @@ def test_pictures_are_no_video(tmp_path: Path, kind: str) -> None:
             load_trajectory(tmp_path / name)
         with pytest.raises(FrameFileError, match=refused):
             _ = Video(tmp_path / name).packets
+
+
+def test_motion_jpeg_with_exif_data_is_turned_or_refused_with_a_remedy(tmp_path: Path) -> None:
+    """PyAV 17.1 to 18.1 cannot read the EXIF data of frames."""
+    exif, file = Image.Exif(), tmp_path / "all.avi"
+    exif[0x0112] = 6
+    with (tmp_path / "all.mjpeg").open("wb") as stored:
+        for t in range(3):
+            Image.fromarray(np.full((32, 48, 3), 80 * t, np.uint8)).save(stored, "jpeg", exif=exif)
+    with av.open(str(tmp_path / "all.mjpeg")) as pictures, av.open(str(file), "w") as video:
+        copied = video.add_stream_from_template(pictures.streams.video[0])
+        for packet in pictures.demux(video=0):
+            if packet.size:
+                packet.stream = copied
+                video.mux(packet)
+    if not (17, 1) <= tuple(map(int, av.__version__.split(".")[:2])) < (19, 0):
+        assert load_trajectory(file).positions.shape == (3, 48, 32, 3)
+    else:
+        with pytest.raises(InvalidSampleError, match=r"^video: expected frames without EXIF .*ffmpeg -i IN .*all\.avi"):
+            load_trajectory(file)
 
 
 class Trap:

@@ -107,8 +107,8 @@ def _errors_of(source: str | Path) -> Iterator[None]:
         raise InvalidSampleError.like(error, where="video", source=str(source)) from error
     except InvalidSampleError as error:
         raise InvalidSampleError.like(error, source=str(source)) from error
-    except (import_av().FFmpegError, OSError, ValueError) as error:
-        located = InvalidSampleError.at("video", "a whole video file", getattr(error, "strerror", None) or error)
+    except (import_av().FFmpegError, OSError) as error:
+        located = InvalidSampleError.at("video", "a whole video file", error.strerror or error)
         raise InvalidSampleError.like(located, source=str(source)) from error
 
 

@@ -154,7 +154,12 @@ class Upright:
 
     def __call__(self, frame: Any) -> UInt8Array:
         """Return uint8 [H, W, 3]. Raises FrameFileError for a frame that FFmpeg would show aslant."""
-        image, matrix = self._rgb(frame), frame.side_data.get("DISPLAYMATRIX")
+        try:
+            image, matrix = self._rgb(frame), frame.side_data.get("DISPLAYMATRIX")
+        except ValueError as error:  # PyAV 17.1 to 18.1 fail on a Motion JPEG video's EXIF data
+            remedy = "encode it anew: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4"
+            expected = f"frames without EXIF data, which PyAV cannot read ({remedy})"
+            raise FrameFileError.of(expected, error) from error
         return image if matrix is None else np.ascontiguousarray(_shown(image, np.frombuffer(bytes(matrix), np.int32)))
 
     def _rgb(self, frame: Any) -> UInt8Array:
