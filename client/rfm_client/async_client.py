@@ -18,10 +18,10 @@ from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import (
     ClientClosedError,
     DeadlineExceededError,
-    InferenceFailedError,
     InvalidValueError,
     ModelNotFoundError,
     RewardError,
+    ServerUnavailableError,
 )
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import (
@@ -301,10 +301,10 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def _why_unready(self) -> str:
         try:
             await self._servers.model_info(frames_name(self.model), Deadline(PROBE_TIMEOUT_S))
-        except (ModelNotFoundError, InferenceFailedError) as error:
+        except ServerUnavailableError as error:
+            return f": {error.fault or error}"
+        except RewardError as error:
             return f": {error}"
-        except RewardError:
-            pass
         return ""
 
     def _call(self, options: CallOptions) -> Call:

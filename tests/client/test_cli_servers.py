@@ -25,7 +25,7 @@ from engine_server import EngineServer
 from gateways import running
 from in_process import rfm_client_app
 from proxies import Proxy
-from rfm_client import AccessDeniedError, InvalidSampleError, RewardClient, Trajectory
+from rfm_client import InvalidSampleError, RewardClient, ServerError, Trajectory
 from rfm_client.command_line import ExitCode
 from servers import Endpoints, RepositoryApi, Served, folder_server, wait_for
 from trajectories import random_trajectory
@@ -161,7 +161,10 @@ def test_wait_returns_when_the_model_is_ready_or_its_time_is_up(engines: EngineS
     result = invoke("wait", "--url", url, "--timeout", 0.2)
     assert result.exit_code == ExitCode.DEADLINE
     remedy = "start a server there (rfm serve), or wait longer (--timeout)"
-    assert result.stderr == f"rfm-client: {url}: rfm and rfm_frames: not ready within 0.2 s: {remedy}\n"
+    assert (
+        result.stderr
+        == f"rfm-client: {url}: rfm and rfm_frames: not ready within 0.2 s: {url}: no connection: Connection refused: {remedy}\n"
+    )
 
 
 def test_an_interrupt_ends_it_without_a_traceback() -> None:
@@ -215,38 +218,38 @@ def test_exit_codes_are_documented_with_every_command() -> None:
 
 NUM_SOURCES = 1000  # more than are scored before the server is gone
 NOT_ASKED = "not asked, since no server answers any more"
-NO_GRPC = "expected an answer of Triton's gRPC port (by default 8001), got one that is not gRPC's; use http:// for its"
-NO_PAGES = "expected Triton's HTTP port (by default 8000), got a server without Triton's pages (404)"
+NO_GRPC = "another server than one of gRPC"
+OF_HTTP = "Triton's HTTP port (by default 8000)"
 PORTS = {
-    ("grpc", "http_port"): NO_GRPC,
-    ("grpc", "metrics_port"): NO_GRPC,
-    ("http", "grpc_port"): "use grpc:// for its gRPC port",
-    ("http", "metrics_port"): NO_PAGES,
+    ("grpc", "http_port"): (ExitCode.UNAVAILABLE, NO_GRPC),
+    ("grpc", "metrics_port"): (ExitCode.UNAVAILABLE, NO_GRPC),
+    ("http", "grpc_port"): (ExitCode.FAILED, OF_HTTP),
+    ("http", "metrics_port"): (ExitCode.FAILED, OF_HTTP),
 }
 
 
 @pytest.mark.parametrize(("scheme", "port"), PORTS)
 def test_the_error_for_a_wrong_port_names_the_right_one(demo_server: Endpoints, scheme: str, port: str) -> None:
     url = f"{scheme}://127.0.0.1:{getattr(demo_server, port)}"
+    code, expected = PORTS[scheme, port]
     for command in ("sample", "status"):
         result = invoke(command, "--url", url)
-        assert (result.exit_code, PORTS[scheme, port] in result.stderr) == (ExitCode.FAILED, True), result.stderr
+        assert (result.exit_code, expected in result.stderr) == (code, True), result.stderr
     result = invoke("wait", "--url", url, "--timeout", 0.5)
-    assert (result.exit_code, PORTS[scheme, port] in result.stderr) == (ExitCode.DEADLINE, True), result.stderr
+    assert (result.exit_code, expected in result.stderr) == (ExitCode.DEADLINE, True), result.stderr
 
 
 def test_the_error_for_tls_to_a_server_without_it_names_the_plain_scheme(demo_server: Endpoints) -> None:
-    for url in (demo_server.grpc_url, demo_server.http_url):
-        secure = url.replace("://", "s://")
-        with RewardClient(secure, retry=False) as client, pytest.raises(AccessDeniedError) as caught:
+    for url, remedy in ((demo_server.grpc_url, "use grpc://"), (demo_server.http_url, "https:// .* only with TLS")):
+        with RewardClient(url.replace("://", "s://"), retry=False) as client, pytest.raises(ServerError, match=remedy):
             client.model_info()
-        assert str(caught.value).endswith(": use grpc:// or http:// for a server without TLS")
 
 
-def test_a_gateway_is_no_triton(demo_server: Endpoints, tmp_path: Path) -> None:
-    with running(demo_server, tmp_path) as gateway:
-        for url, expected in ((gateway.url, NO_PAGES), (gateway.url.replace("http", "grpc"), NO_GRPC)):
-            assert expected in invoke("sample", "--url", url).stderr
+def test_a_gateway_and_a_folder_are_no_triton(demo_server: Endpoints, tmp_path: Path) -> None:
+    with running(demo_server, tmp_path) as gateway, folder_server(tmp_path) as folder:
+        assert NO_GRPC in invoke("sample", "--url", gateway.url.replace("http", "grpc")).stderr
+        for url in (gateway.url, folder):
+            assert f"expected {OF_HTTP}, got " in invoke("sample", "--url", url).stderr
 
 
 ENDS = {"has gone": ExitCode.UNAVAILABLE, "hangs": ExitCode.DEADLINE}

@@ -46,7 +46,7 @@ _NO_CONNECTION = re.compile(  # gRPC's own messages: nothing was sent
     "failed to connect|connections to all backends failing|errors resolving|resolution failed"
 )
 _REASON = re.compile(r"(?:: |\[)((?:Connection|Domain name|Name|No route|Network)[\w ]+)\]?$")  # from libc or gRPC
-_NO_GRPC = re.compile("Failed parsing HTTP/2|http1")  # another protocol's answer
+_NO_GRPC = re.compile("Failed parsing HTTP/2|http1|: Socket closed")  # another protocol's answer
 _PROXY_ALONE = "http2 header with status: 502"  # a proxy answered, but the server behind it did not
 _LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # or a proxy's
 _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|{RESTRICTED}")
@@ -72,7 +72,8 @@ _FIELDS = re.compile(r"(\S+): expected (.*?), got (.*)", re.DOTALL)  # as writte
 _PREFIX = re.compile(r"^(\[request id: [^\]]*\] )?(in ensemble '[^']*', )?")  # the caller knows both
 
 FEWER_FRAMES = "score some of them (subsample=True), each on few before it (frame_steps), or by a sampling rule"
-_START = "start the server there (rfm serve), or give the URL of one that runs (with TLS grpcs:// or https://)"
+_START = "start the server there (rfm serve), or give the URL of one that runs (https:// and grpcs:// only with TLS)"
+_GRPC_PORT = "give Triton's gRPC port (by default 8001), or http:// for its HTTP port, or grpcs:// with TLS"
 _NAME = "give the checkpoint's name with model (--model)"
 _SHOW_KEY = "show the key that it wants with api_key (--api-key-file) or headers"
 _TRUST = {
@@ -123,7 +124,8 @@ def error_from(raised: Exception, url: str, bad_request: BadRequest = invalid_sa
                 lost.may_have_ended_server = True
                 return lost
             case "ValueError" | "LookupError" | "TypeError" | "AttributeError":  # from an answer that is not Triton's
-                return errors.InferenceFailedError(f"{url}: the answer cannot be read: {raised!r}")
+                expected = "an answer of Triton's HTTP port (by default 8000) or gRPC port (8001)"
+                return errors.InferenceFailedError(f"{url}: expected {expected}, got an unreadable one: {raised!r}")
     return None
 
 
@@ -131,11 +133,6 @@ def _error_of_answer(answer: Any, url: str, bad_request: BadRequest) -> errors.R
     status, message = str(answer.status()), answer.message() or ""
     if is_denied(status, message):
         return denied(url, status, message)
-    if status == "StatusCode.UNAVAILABLE" and _NO_GRPC.search(message):
-        return errors.InferenceFailedError(
-            f"{url}: expected an answer of Triton's gRPC port (by default 8001), got one that is not gRPC's; "
-            "use http:// for its HTTP port"
-        )
     if status == "StatusCode.UNAVAILABLE" and (_NO_CONNECTION.search(message) or _PROXY_ALONE in message):
         return unreachable(url, message)
     return error_of(status, message, bad_request)
@@ -180,10 +177,12 @@ def denied(url: str, status: str, message: str) -> errors.AccessDeniedError:
 def unreachable(url: str, reason: str) -> errors.ServerUnavailableError:
     """Return the error for a failed connection to the server or its proxy."""
     found = _REASON.search(reason)
-    remedy = _START
+    reason, remedy = (found[1] if found else reason), _START
+    if url.startswith("grpc") and _NO_GRPC.search(reason):
+        reason, remedy = "another server than one of gRPC", _GRPC_PORT
     if proxy := grpc_proxy(url):
         remedy += f"; or add the host to no_proxy, unless {proxy} names the proxy that leads to it"
-    return _with_remedy(errors.ServerUnavailableError, f"{url}: no connection: {found[1] if found else reason}", remedy)
+    return _with_remedy(errors.ServerUnavailableError, f"{url}: no connection: {reason}", remedy)
 
 
 def not_served(model: str, message: str, served: Collection[str]) -> errors.ModelNotFoundError:
