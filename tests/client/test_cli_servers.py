@@ -51,6 +51,7 @@ def test_status_reports_the_counts_of_triton(served: Served) -> None:
         return server, {model["name"]: model for model in server["models"]}
 
     wait_for(lambda: (shown()[1][MODEL]["batches"] or {"count": 0})["count"])  # the model reports once a second
+    wait_for(lambda: all(device["memory_used_bytes"] for device in shown()[0]["devices"]))  # first after two seconds
     server, models = shown()
     assert (server["ready"], server["version"], server["metrics_error"]) == (True, "2.51.0", None)
     with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
@@ -218,7 +219,7 @@ def test_exit_codes_are_documented_with_every_command() -> None:
 
 NUM_SOURCES = 1000  # more than are scored before the server is gone
 NOT_ASKED = "not asked, since no server answers any more"
-NO_GRPC = "another server than one of gRPC"
+NO_GRPC = "no answer of a gRPC server: give Triton's gRPC port (by default 8001)"
 OF_HTTP = "Triton's HTTP port (by default 8000)"
 PORTS = {
     ("grpc", "http_port"): (ExitCode.UNAVAILABLE, NO_GRPC),

@@ -179,7 +179,7 @@ def unreachable(url: str, reason: str) -> errors.ServerUnavailableError:
     found = _REASON.search(reason)
     reason, remedy = (found[1] if found else reason), _START
     if url.startswith("grpc") and _NO_GRPC.search(reason):
-        reason, remedy = "another server than one of gRPC", _GRPC_PORT
+        reason, remedy = "no answer of a gRPC server", _GRPC_PORT
     if proxy := grpc_proxy(url):
         remedy += f"; or add the host to no_proxy, unless {proxy} names the proxy that leads to it"
     return _with_remedy(errors.ServerUnavailableError, f"{url}: no connection: {reason}", remedy)

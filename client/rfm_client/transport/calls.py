@@ -116,7 +116,10 @@ class TritonTransport:
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
         async def request(client: Any) -> bool:
-            return bool(await client.is_server_ready() and await client.is_model_ready(model))
+            is_ready = bool(await client.is_server_ready() and await client.is_model_ready(model))
+            if is_ready and not self._is_grpc:
+                await client.get_server_metadata()  # Triton's metrics port says that everything is ready
+            return is_ready
 
         try:
             return await self.call(request, timeout_s)
