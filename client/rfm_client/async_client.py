@@ -18,10 +18,10 @@ from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import (
     ClientClosedError,
     DeadlineExceededError,
-    InferenceFailedError,
     InvalidValueError,
     ModelNotFoundError,
     RewardError,
+    ServerUnavailableError,
 )
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import (
@@ -41,7 +41,7 @@ from rfm_client.episodes.steps import Steps
 from rfm_client.frames.fit_to_checkpoint import resize_frames
 from rfm_client.frames.sampling import Sampling
 from rfm_client.scoring.samples import Call, CallOptions, SampleScorer, results_of
-from rfm_client.transport.calls import Transport, connect
+from rfm_client.transport.calls import Transport, TritonTransport
 from rfm_client.transport.connection import Credentials
 from rfm_client.transport.limits import ConcurrencyLimiter, Deadline, check_timeout
 from rfm_client.transport.servers import PROBE_TIMEOUT_S, Servers
@@ -115,7 +115,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         transports = self.transports
         if not transports:
             urls = [self.urls] if isinstance(self.urls, str) else self.urls
-            transports = [connect(url, shared_memory=self.shared_memory, credentials=credentials) for url in urls]
+            transports = [TritonTransport(url, credentials, shared_memory=self.shared_memory) for url in urls]
         self._servers = Servers(transports, retry=self.retry)
         self._scorer = SampleScorer(self.model, self._servers, ConcurrencyLimiter(self.max_in_flight))
         self._steps = StepScorer(self.model, self._scorer, len(self._servers))
@@ -248,9 +248,8 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         return await self._servers.is_ready((self.model, frames_name(self.model)), left_s)
 
     async def wait_ready(self, timeout_s: float) -> None:
-        """Wait until ``is_ready``. Raises DeadlineExceededError, or ServerUnavailableError for wrong ports."""
+        """Wait until ``is_ready``. Raises DeadlineExceededError."""
         deadline = self._deadline(timeout_s)
-        await self._servers.check_ports()
         while deadline.ends_within(0) or not await self.is_ready(
             timeout_s=min(PROBE_TIMEOUT_S, deadline.remaining_s())
         ):
@@ -302,10 +301,10 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def _why_unready(self) -> str:
         try:
             await self._servers.model_info(frames_name(self.model), Deadline(PROBE_TIMEOUT_S))
-        except (ModelNotFoundError, InferenceFailedError) as error:
+        except ServerUnavailableError as error:
+            return f": {error.fault or error}"
+        except RewardError as error:
             return f": {error}"
-        except RewardError:
-            pass
         return ""
 
     def _call(self, options: CallOptions) -> Call:

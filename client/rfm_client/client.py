@@ -140,7 +140,7 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         return self._loop.wait(self._client.is_ready(timeout_s=timeout_s))
 
     def wait_ready(self, timeout_s: float) -> None:
-        """Wait until ``is_ready``. Raises DeadlineExceededError, or ServerUnavailableError for wrong ports."""
+        """Wait until ``is_ready``. Raises DeadlineExceededError."""
         self._loop.wait(self._client.wait_ready(timeout_s))
 
     def model_info(self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None) -> ModelInfo:

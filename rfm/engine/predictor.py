@@ -99,7 +99,8 @@ def check_type(sample: Sample, config: Any) -> None:
     config: the network's configuration
     """
     heads = {"preference": config.has_preference, "similarity": config.has_similarity}
-    asked = {PreferenceSample: "preference", SimilaritySample: "similarity"}.get(type(sample))
+    kinds: dict[type, str] = {PreferenceSample: "preference", SimilaritySample: "similarity"}
+    asked = kinds.get(type(sample))
     if asked is not None and not heads[asked]:
         supported = " or ".join(["progress", *(name for name, is_there in heads.items() if is_there)])
         raise InvalidSampleError.at("sample_type", f"{supported} (this checkpoint has no {asked} head)", asked)

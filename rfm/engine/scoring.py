@@ -24,7 +24,6 @@ from rfm.engine.layers import keep_float32
 from rfm.engine.predictor import Predictor, RowScores, of_prefixes
 from rfm_client.contract import (
     FRAME_SCORES,
-    BatchTiming,
     InferenceFailedError,
     InvalidSampleError,
     PreferenceResult,
@@ -36,7 +35,7 @@ from rfm_client.contract import (
     Sample,
     SimilarityResult,
 )
-from rfm_client.contract.results import answer, trajectory_scores
+from rfm_client.contract.results import BatchTiming, answer, trajectory_scores
 from rfm_client.contract.samples import EncoderSample, with_trajectories
 
 Outcome: TypeAlias = Result | RewardError

@@ -30,7 +30,7 @@ from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.pictures import Panel, plot
 from rfm_client.cli.scoring import Source
 from rfm_client.command_line import ExitCode
-from servers import Served, folder_server
+from servers import Served
 from shelves import Shelf
 from tolerances import TOLERANCE
 from trajectories import random_trajectory
@@ -57,7 +57,7 @@ def test_score_writes_the_client_s_scores_and_one_bad_video_does_not_stop_the_ot
     assert result.returncode == ExitCode.FAILED
     assert result.stderr.splitlines() == [
         f"rfm-client: note: {video}: 16 of 32 frames were scored, evenly spaced",
-        f"rfm-client: {missing}: video: expected a video file, got no file of this name",
+        f"rfm-client: {missing}: video: expected a video file, got none",
     ]
     with engines.client(MODEL) as client:
         filmed = client.progress(load_trajectory(video, task=TASK, fps=10), subsample=True)
@@ -122,14 +122,6 @@ def test_score_and_compare_apply_the_options_orient_and_channels(
         assert_scores(told["videos"][0], client.progress(first))
         preference = client.preference(first, second).preference
     assert compared["preference"] == pytest.approx(preference, abs=TOLERANCE)
-
-
-def test_score_reads_videos_behind_urls(engines: EngineServer, video: Path) -> None:
-    with folder_server(video.parent) as url:
-        result = ask(engines, "score", f"{url}/clip.mp4", video, "--task", TASK, "--json", "-")
-    remote, local = json.loads(result.stdout)["videos"]
-    np.testing.assert_allclose(remote["progress"], local["progress"], rtol=0, atol=TOLERANCE)
-    assert remote["frame_times_s"] is None
 
 
 def test_compare_asks_both_orders_of_every_two_videos_and_shows_the_scores_of_score(

@@ -20,7 +20,6 @@ from proxies import Proxy
 from repositories import bound_queue, configure
 from rfm_client import (
     DeadlineExceededError,
-    ProgressResult,
     ProgressSample,
     RewardClient,
     ServerUnavailableError,
@@ -55,17 +54,6 @@ def port(engines: EngineServer) -> int:
     with engines.client("rfm") as client:
         client.wait_ready(PATIENCE_S)
     return int(engines.url.rpartition(":")[2])
-
-
-@pytest.mark.slow
-def test_a_connection_that_dies_in_silence_costs_one_deadline(port: int) -> None:
-    with Proxy(port) as proxy, RewardClient(f"grpc://127.0.0.1:{proxy.port}", timeout_s=1.5) as client:
-        expected = client.progress(trajectory(0), timeout_s=PATIENCE_S)
-        proxy.go_silent()
-        outcomes = [client.evaluate([ProgressSample(trajectory(0))], return_errors=True)[0] for _ in range(5)]
-        assert [type(outcome) for outcome in outcomes] == [DeadlineExceededError, *[ProgressResult] * 4]
-        assert_same(expected, outcomes[-1])
-        assert proxy.num_connections == 2
 
 
 @pytest.mark.slow

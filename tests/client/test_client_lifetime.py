@@ -143,21 +143,18 @@ assert not RewardClient("http://127.0.0.1:1").is_ready()
     assert (done.returncode, done.stderr) == (0, "")
 
 
-BRACKETS = "brackets around an IPv6 address, "
-WRONG_URLS = {
-    **dict.fromkeys(("localhost:8001", "grpc://localhost", "", "ftp://b:2", "grpc://a:70000"), "grpc://host:port or "),
-    "grpc://::1:8001": f"{BRACKETS}grpc://[::1]:8001,",
-    "http://2001:db8::7:8000": f"{BRACKETS}http://[2001:db8::7]:8000,",
-    "grpc://::1": f"{BRACKETS}grpc://[::1]:8001,",
-}
+WRONG_URLS = (
+    *("localhost:8001", "grpc://localhost", "", "ftp://b:2", "grpc://a:70000", "dns:///a:8001"),
+    *("grpc://::1:8001", "http://2001:db8::7:8000", "grpc://::1"),
+)
 
 
-def test_a_client_needs_a_right_url_which_may_be_written_as_grpc_does() -> None:
-    RewardClient("dns:///rfm-triton-pods:8001").close()
+def test_a_client_needs_a_right_url() -> None:
     with pytest.raises(ValueError, match="url: expected at least one, got none"):
         RewardClient([])
-    for url, expected in WRONG_URLS.items():
-        with pytest.raises(ValueError, match=rf"^url: expected {re.escape(expected)}.* got {re.escape(repr(url))}$"):
+    for url in WRONG_URLS:
+        expected = r"grpc://host:port or .* \(brackets around an IPv6 address\)"
+        with pytest.raises(ValueError, match=rf"^url: expected {expected}, got {re.escape(repr(url))}$"):
             RewardClient(["grpc://a:1", url])
 
 

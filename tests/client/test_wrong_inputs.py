@@ -19,7 +19,7 @@ from paths import ROOT
 from servers import Endpoints
 
 NOBODY = "grpc://localhost:1"  # where no server listens
-STARTED = "start the server there (rfm serve), or give the URL of one that runs"
+STARTED = "start the server there (rfm serve), or give the URL of one that runs (https:// and grpcs:// only with TLS)"
 URL = "expected grpc://host:port or http://host:port, or grpcs:// or https://, got"
 DATASET = (
     "expected a LeRobot dataset (meta/info.json), an RLDS dataset (features.json), an HDF5 file (.hdf5, .h5), a folder "
@@ -134,7 +134,7 @@ FAILURES = {
     "rfm export file.txt --repository out": (1, f"{SOURCE} the file file.txt"),
     "rfm export empty --repository out --name 'a b'": (1, "--name: expected letters, digits, _ and -, got 'a b'"),
     f"rfm models list --url {NOBODY}": (1, f"{NOBODY}: no connection: Connection refused: {STARTED}"),
-    "rfm try nope.mp4 --task x": (1, "video: expected a video file, got no file of this name (nope.mp4)"),
+    "rfm try nope.mp4 --task x": (1, "video: expected a video file, got none (nope.mp4)"),
 }
 
 NO_TASK = 'task: expected a sentence with frames, got none: add --task "SENTENCE"'

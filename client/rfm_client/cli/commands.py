@@ -66,7 +66,7 @@ app = typer.Typer(
 
 _APPLICATIONS = {"evaluate": "labels", "gateway": "gateway", "label": "labels"}  # the package for each command
 
-VIDEOS = "Videos, .npy or .npz files, or URLs of videos."
+VIDEOS = "Videos, or .npy or .npz files."
 
 
 def _print_version(is_wanted: bool) -> None:

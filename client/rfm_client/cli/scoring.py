@@ -60,11 +60,11 @@ class Source:
 
     @classmethod
     def read(cls, name: str, video: VideoOptions) -> Source:
-        """Read the source from a file or URL. Raises InvalidSampleError."""
+        """Read the source from a file. Raises InvalidSampleError."""
         from rfm_client.frames.inputs import ARRAY_SUFFIXES, load_trajectory
-        from rfm_client.frames.video import frame_times_s, is_url
+        from rfm_client.frames.video import frame_times_s
 
-        are_arrays = not is_url(name) and PurePath(name).suffix.lower() in ARRAY_SUFFIXES
+        are_arrays = PurePath(name).suffix.lower() in ARRAY_SUFFIXES
         fps = None if are_arrays else video.fps
         trajectory = load_trajectory(
             name, task=video.task, fps=fps, orient=video.orient, channels=video.channels, **video.more
@@ -72,9 +72,7 @@ class Source:
         if trajectory.frames is not None and is_blank(trajectory.task):
             own = repr(trajectory.task) if trajectory.task.strip() else "none"
             raise InvalidSampleError.at("task", "a sentence with frames", f'{own}: add --task "SENTENCE"')
-        # A video from a URL is not kept, so its times cannot be read.
-        has_times = not are_arrays and not is_url(name)
-        return cls(name, trajectory, frame_times_s(name, trajectory.num_frames) if has_times else None)
+        return cls(name, trajectory, None if are_arrays else frame_times_s(name, trajectory.num_frames))
 
     def times_of(self, scores: FrameScores) -> Times | None:
         """Return the scored frames' times in the video, float64 [T]; None: unknown."""

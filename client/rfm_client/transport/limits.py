@@ -9,8 +9,6 @@ import time
 from collections.abc import AsyncIterator, Collection
 from contextlib import asynccontextmanager
 
-import numpy as np
-
 if sys.version_info >= (3, 11):
     from asyncio import timeout as timeout
 else:
@@ -20,9 +18,8 @@ from rfm_client.contract.checks import checked_count, checked_positive
 from rfm_client.contract.errors import DeadlineExceededError, InvalidSampleError
 from rfm_client.contract.wire import Tensors
 
-MAX_REQUEST_BYTES = 2**31 - 2**16  # gRPC and Triton's HTTP server count message bytes in 32 bits; rest: headers
+MAX_REQUEST_BYTES = 2**31 - 2**16  # gRPC and Triton's HTTP server count message bytes in 32 bits; rest: headers, texts
 _BYTES_PER_GB = 1e9
-_LENGTH_BYTES = 4  # before every text
 MAX_BYTES = 256 * 2**20  # input bytes; writing to a socket holds several copies
 MAX_TIMEOUT_S = 1e9  # more than 30 years; Triton counts nanoseconds, and not many more
 
@@ -62,7 +59,7 @@ def check_size(inputs: Tensors, shared: Collection[str]) -> None:
 
     shared: names of inputs in shared memory
     """
-    sizes = {name: _num_bytes(inputs, name) for name in inputs if name not in shared}
+    sizes = {name: array.nbytes for name, array in inputs.items() if name not in shared}
     if sum(sizes.values()) <= MAX_REQUEST_BYTES:
         return
     raise InvalidSampleError.at(
@@ -72,13 +69,6 @@ def check_size(inputs: Tensors, shared: Collection[str]) -> None:
         "shrink the frames (resize, --resize), score fewer (subsample, or --fps for videos), or share memory with a "
         "server on this host (shared_memory)",
     )
-
-
-def _num_bytes(inputs: Tensors, name: str) -> int:
-    array = inputs[name]
-    if array.dtype != np.object_:
-        return array.nbytes
-    return sum(len(text) + _LENGTH_BYTES for text in array.ravel())
 
 
 class ConcurrencyLimiter:

@@ -36,8 +36,7 @@ from rfm_client.contract.errors import (
     clear_variables,
 )
 from rfm_client.contract.wire import Tensors
-from rfm_client.transport.calls import Answer, Transport, TritonTransport
-from rfm_client.transport.connection import WRONG_PORT_ERRORS, wrong_port
+from rfm_client.transport.calls import Answer, Transport
 from rfm_client.transport.limits import Deadline
 
 Answered = TypeVar("Answered")
@@ -58,7 +57,6 @@ class KnownServer:
     """One of several servers: transport, load and failures.
 
     failures: how often the server was left out since the last success
-    has_answered: True after the first success
     comeback: ends when the server reports ready again; None: never left out
     """
 
@@ -67,7 +65,6 @@ class KnownServer:
         self.outstanding = 0
         self.last_request = 0
         self.failures = 0
-        self.has_answered = False
         self.comeback: asyncio.Task[None] | None = None
 
     @property
@@ -84,20 +81,9 @@ class KnownServer:
         finally:
             self.outstanding -= 1
 
-    async def rested(self, model: str) -> None:
-        """Pause, longer after each failure, then wait until the server reports ready."""
-        await asyncio.sleep(pause_s(self.failures - 1, LONGEST_REST_S))
-        for attempt in itertools.count():
-            if await self.transport.is_ready(model, PROBE_TIMEOUT_S):
-                return
-            await asyncio.sleep(pause_s(attempt, LONGEST_PAUSE_S))
-
-    async def back(self, model: str, *, was_down: bool) -> None:
-        """Wait until the server is ready again after a process or the connection ended.
-
-        Triton 2.51 reports a dead model as ready. So wait for RESTART_S, or until the server has reported not ready.
-        """
-        until_s = time.monotonic() + RESTART_S
+    async def back(self, model: str, rest_s: float) -> None:
+        """Wait until the server is ready after ``rest_s``, or ready after it has reported not ready."""
+        until_s, was_down = time.monotonic() + rest_s, False
         while True:
             is_ready = await self.transport.is_ready(model, PROBE_TIMEOUT_S)
             if is_ready and (was_down or time.monotonic() >= until_s):
@@ -189,12 +175,6 @@ class Servers:
             for probe in probes:
                 probe.cancel()
 
-    async def check_ports(self) -> None:
-        """Raise ServerUnavailableError if all URLs have a wrong port: waiting would not help."""
-        named = await self._wrong_ports()
-        if named and named[0] is not None and all(named):
-            raise ServerUnavailableError(named[0])
-
     def stop_retrying(self) -> None:
         """Let later failures end their calls at once, without a message in the log."""
         self._retry = False
@@ -216,9 +196,6 @@ class Servers:
             clear_variables(error)
             if self._is_closed and not _is_task_cancelled():  # closing connections raise errors from many classes
                 raise ClientClosedError("this client was closed during the call") from error
-            if isinstance(error, WRONG_PORT_ERRORS) and not any(server.has_answered for server in self._servers):
-                for named in filter(None, await self._wrong_ports()):
-                    raise ServerUnavailableError(named) from error
             raise
 
     async def _until_answered(
@@ -238,7 +215,7 @@ class Servers:
                 failed = failures.get(server)
                 if failed is not None and left_s < deadline.timeout_s / 2:
                     raise failed from failed.__cause__  # this failure took most of the time
-                raise deadline.exceeded(error.server or server.transport.url) from error
+                raise deadline.exceeded(server.transport.url) from error
             except (AccessDeniedError, InferenceFailedError, ModelNotFoundError) as error:
                 refusals[server] = error
                 if not self._retry:
@@ -268,7 +245,7 @@ class Servers:
                 if deadline.ends_within(0):  # the pause took longer than planned
                     raise
             else:
-                server.failures, server.has_answered = 0, True
+                server.failures = 0
                 for other, refusal in refusals.items():  # not before: if all refuse, no server is at fault
                     self._leave_out(other, model, refusal)
                 return answer
@@ -289,16 +266,15 @@ class Servers:
         if server.is_left_out or self._is_closed:
             return  # the same failure, or closing
         server.failures += 1
-        if error.may_have_ended_server:
-            was_down = not isinstance(error, ProcessEndedError)
-            server.comeback = asyncio.create_task(server.back(model, was_down=was_down))
+        if isinstance(error, ProcessEndedError):
+            rest_s = RESTART_S  # Triton 2.51 reports a dead model as ready
+        elif error.may_have_ended_server:
+            rest_s = 0.0
         elif len(self._servers) > 1:
-            server.comeback = asyncio.create_task(server.rested(model))
-
-    async def _wrong_ports(self) -> list[str | None]:
-        """Return what is wrong with each server's port; None: no fault found."""
-        ours = [server.transport.url for server in self._servers if isinstance(server.transport, TritonTransport)]
-        return [await asyncio.to_thread(wrong_port, url) for url in ours]
+            rest_s = pause_s(server.failures - 1, LONGEST_REST_S)
+        else:
+            return
+        server.comeback = asyncio.create_task(server.back(model, rest_s))
 
 
 def _is_task_cancelled() -> bool:
