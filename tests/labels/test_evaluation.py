@@ -15,11 +15,9 @@ import pytest
 from pyarrow import parquet
 
 from in_process import rfm_client
-from labelling import FEW, LEROBOT, WRIST, BrightnessScorer
+from labelling import WRIST, BrightnessScorer
 from rfm_client import FrameScores
 from rfm_labels import DatasetError, LabelOptions, evaluate_labels, label, open_dataset, read_outcomes, summarise
-from rfm_labels.label_files import read_cost
-from rfm_labels.metadata import Cost
 from rfm_labels.summary import voted_success
 from shown_datasets import copied
 
@@ -107,37 +105,6 @@ def test_models_are_compared_on_the_episodes_and_frames_that_both_have(tmp_path:
     assert agreement.spearman == pytest.approx((-1 + 1) / 2)
     distances = [np.mean([0.9, 0.3, 0.3, 0.9]), np.mean([0.1, 0.2, 0.4])]
     assert agreement.distance == pytest.approx(np.mean(distances), abs=1e-6)
-
-
-def test_the_cost_is_that_of_the_last_run_that_scored(tmp_path: Path) -> None:
-    dataset, output = open_dataset(LEROBOT / "toy_v30_many"), tmp_path / "labels"
-
-    def rate_after(episodes: range) -> tuple[int, float | None]:
-        scorer = BrightnessScorer()
-        label(dataset, scorer, LabelOptions(output=output, workers=1, episodes=episodes, **FEW))
-        cost = read_cost(output / "rfm_progress.parquet")
-        assert cost is not None
-        assert scorer.num_samples in (0, cost.frames)
-        files = output / "rfm_progress.parquet", output / "reward_signals" / "rfm.parquet"
-        (rate,) = {each.frames_per_s for each in evaluate_labels(files).evaluations}
-        assert rate == cost.frames / cost.seconds
-        return scorer.num_samples, rate
-
-    rate_after(range(3))
-    scored, rate = rate_after(range(5))
-    assert scored == sum(episode.num_frames for episode in dataset.episodes[3:5])
-    assert rate_after(range(5)) == (0, rate)
-
-
-def test_a_file_that_does_not_say_its_cost_has_none(tmp_path: Path) -> None:
-    file = labels(tmp_path / "a.parquet", {0: RISING})
-    (found,) = evaluate_labels([file]).evaluations
-    assert found.frames_per_s is None
-    done = rfm_client("evaluate", tmp_path, "--labels", file)
-    assert re.search(r"frames/s.*\n.*\n  a .* -\s", done.stdout), done.output
-    for told in ("soon", "[]", '{"frames": 3}', '{"frames": 0, "seconds": 1.0}', '{"frames": 3, "seconds": NaN}'):
-        assert Cost.parse(told.encode()) is None
-    assert Cost.parse(Cost(3, 0.5).json()) == Cost(3, 0.5)
 
 
 def written(file: Path, text: str) -> str:

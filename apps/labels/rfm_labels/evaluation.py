@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.datasets.lerobot_meta import EPISODES_FILE, column_types, json_lines, read_table
-from rfm_labels.label_files import read_cost, read_label_table, reward_name
+from rfm_labels.label_files import read_label_table, reward_name
 from rfm_labels.metadata import PROGRESS, SUCCESS
 from rfm_labels.summary import BACKWARDS_BY, voted_success
 
@@ -58,7 +58,6 @@ class Evaluation:
     final_of_successes, final_of_failures: mean progress at the last frame; None: no such episode
     final: mean progress at the last frame, over all episodes
     backwards: mean share of steps on which progress falls by more than 0.01
-    frames_per_s: labelling speed; None: not in the file
     final_progress: float64 [E], progress at the last frame
     """
 
@@ -74,7 +73,6 @@ class Evaluation:
     final_of_failures: float | None
     final: float
     backwards: float
-    frames_per_s: float | None
     final_progress: Floats
 
 
@@ -139,10 +137,7 @@ def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool | None] |
         common = [episode for episode in common if outcomes[episode] is not None]
         require("outcome", len(common) > 0, "one that is known", f"none for {in_all} episodes")
     is_success = None if outcomes is None else np.array([outcomes[episode] for episode in common])
-    evaluations = [
-        _evaluation(name, file, [read[name][each] for each in common], is_success)
-        for name, file in zip(names, files, strict=True)
-    ]
+    evaluations = [_evaluation(name, [read[name][each] for each in common], is_success) for name in names]
     pairs = [(first, second) for index, first in enumerate(names) for second in names[index + 1 :]]
     agreements = [_agreement(first, second, read[first], read[second], common) for first, second in pairs]
     return LabelComparison(evaluations, agreements, common, is_success, len(everywhere) - in_all, in_all - len(common))
@@ -232,10 +227,7 @@ def _episodes(file: Path) -> dict[int, _Scores]:
     return scores
 
 
-def _evaluation(
-    name: str, file: Path, scores: Sequence[_Scores], is_success: npt.NDArray[np.bool_] | None
-) -> Evaluation:
-    cost = read_cost(file)
+def _evaluation(name: str, scores: Sequence[_Scores], is_success: npt.NDArray[np.bool_] | None) -> Evaluation:
     final = np.array([each.progress[-1] for each in scores], np.float64)
     orders = [_order(each.progress) for index, each in enumerate(scores) if is_success is None or is_success[index]]
     known = [order for order in orders if order is not None]
@@ -254,7 +246,6 @@ def _evaluation(
         final_of_failures=None if is_success is None else _mean(final[~is_success]),
         final=float(final.mean()),
         backwards=float(np.mean(falls)),
-        frames_per_s=None if cost is None else cost.frames_per_s,
         final_progress=final,
     )
 

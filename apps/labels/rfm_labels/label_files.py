@@ -21,14 +21,12 @@ from rfm_labels.metadata import (
     PROGRESS,
     SUCCESS,
     BlankCameras,
-    Cost,
     blank_from_metadata,
     parsed_object,
     skipping_in,
 )
 from rfm_labels.plan import Plan
 from rfm_labels.writing import (
-    COST_KEY,
     EPISODES_KEY,
     IDENTITY,
     PROGRESS_ENDING,
@@ -116,11 +114,6 @@ def read_label_table(file: Path, *, episode: int | None = None) -> Any:
     return table.select(list(columns.values())).rename_columns(list(columns))
 
 
-def read_cost(file: Path) -> Cost | None:
-    """Return what the labels cost; None: not in the file. Raises DatasetError."""
-    return Cost.parse(_metadata(file).get(COST_KEY))
-
-
 def read_blank(file: Path) -> BlankCameras:
     """Read the blank cameras from a label file's metadata. Raises DatasetError."""
     return blank_from_metadata(_metadata(file))
@@ -193,14 +186,12 @@ class LabelFile:
 
     provenance: writer, dataset and recipe; empty: another program wrote the labels
     digests: digest by episode number
-    cost: from the last run that scored; None: unknown
     option: command-line option that chooses another path
     """
 
     path: Path
     provenance: Mapping[str, Any]
     digests: Mapping[int, str]
-    cost: Cost | None
     option: str
 
     @classmethod
@@ -213,7 +204,7 @@ class LabelFile:
         is_own = str(provenance.get("writer")).startswith("rfm-client") and isinstance(provenance.get("dataset"), dict)
         by_number = parsed_object(metadata.get(EPISODES_KEY)) if is_own else {}
         digests = {int(number): str(digest) for number, digest in by_number.items() if number.isdecimal()}
-        return cls(path, provenance if is_own else {}, digests, Cost.parse(metadata.get(COST_KEY)), option)
+        return cls(path, provenance if is_own else {}, digests, option)
 
     def check(self, plan: Plan) -> None:
         """Raise DatasetError unless the plan reproduces all labels in the file by the same recipe."""
@@ -228,7 +219,7 @@ class LabelFile:
         got = f"those of {listed(lost)}, too"
         require(self.path, not lost, "labels of the chosen episodes alone", got)
         changed = sorted(number for number, digest in self.digests.items() if planned[number] != digest)
-        got = f"others for {listed(changed)}, whose frames or rows have changed (copied videos: --verify)"
+        got = f"others for {listed(changed)}, whose frames or rows have changed (copy videos with their times: cp -p)"
         require(self.path, not changed, "labels of the episodes as they are now", got)
 
 

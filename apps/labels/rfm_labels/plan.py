@@ -69,7 +69,6 @@ class Recipe:
     views: further cameras, shown beside the single entry in ``cameras``
     decoders: library and version that decode each camera, since colours differ between versions; None: stored as pixels
     corrections: for cameras whose frames are turned, or stored as BGR
-    verify: True: identify videos by content
     progress_rule: derives progress from remaining seconds; None: the checkpoint predicts progress
     """
 
@@ -81,7 +80,6 @@ class Recipe:
     mode: Mode
     fuse: Fuse
     resize: bool
-    verify: bool
     progress_rule: ProgressRule | None = None
     views: tuple[str, ...] = ()
     goal: Goal | None = None
@@ -119,7 +117,6 @@ class Recipe:
             mode=options.mode,
             fuse=options.fuse,
             resize=options.resize,
-            verify=options.verify,
             progress_rule=options.progress_rule,
             views=views,
             goal=None if options.goal is None else Goal.of(options.goal),
@@ -159,7 +156,7 @@ class Recipe:
             "mode": self.mode,
             "fuse": self.fuse if len(self.cameras) > 1 else None,
             "resize": str(self.checkpoint.frame_size) if self.resize else None,
-            "verify": self.verify,
+            "verify": False,  # of older labels: True for videos identified by content
             **{name: value for name in _OPTIONAL if (value := getattr(self, name))},
             **({"views": list(self.views)} if self.views else {}),
             **({} if self.goal is None else {"goal": self.goal.document()}),
@@ -253,7 +250,7 @@ def make_plan(dataset: Dataset, recipe: Recipe, episodes: Iterable[DatasetEpisod
     for episode in episodes:
         about = f"{episode.index} {episode.first_index} {episode.num_frames} {episode.task}"
         about += f" {episode.tasks}" if episode.tasks else ""
-        videos = [f"{each} {dataset.identity(episode, each, verify=recipe.verify)}" for each in recipe.decoded_cameras]
+        videos = [f"{each} {dataset.identity(episode, each)}" for each in recipe.decoded_cameras]
         items.append(Item(episode, digest_of(part.encode() for part in (document, about, *videos))))
     return Plan(items, recipe, {"kind": dataset.kind, "source": dataset.source, "revision": dataset.revision})
 

@@ -126,8 +126,6 @@ def label_with_ray(
 ) -> Report:
     """Label like ``label``, on a Ray cluster. Each actor opens the dataset and connects on its own.
 
-    The files record no cost for this run: actors start and end while others label.
-
     source, opening: arguments for ``open_dataset``
     connect: returns a context with a scorer, on any node; this process uses it to read the checkpoint's facts
     """
@@ -137,4 +135,4 @@ def label_with_ray(
         plan = planned(dataset, scorer, outputs, watch, writes=True)
     job = RayJob(source, opening, connect, plan, outputs.parts.url, options.workers)
     failures = finish_all_with_ray(job, ray, watch)
-    return put_together(plan, dataset, outputs, failures, None, watch)
+    return put_together(plan, dataset, outputs, failures, watch)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -39,7 +38,7 @@ from rfm_client.frames import BlankFrames, resize_frames
 from rfm_client.options import InvalidValueError
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.datasets.faults import require
-from rfm_labels.metadata import SCORES, Columns, Cost
+from rfm_labels.metadata import SCORES, Columns
 from rfm_labels.options import Watch
 from rfm_labels.plan import Item, Plan, Recipe
 from rfm_labels.scorer import DECISIVE, Scorer
@@ -74,12 +73,6 @@ class Run:
         self._lock = threading.Lock()
         self._failures: list[FailedEpisode] = []
         self._cause: Exception | None = None
-        self._frames_scored, self._seconds = 0, 0.0
-
-    @property
-    def cost(self) -> Cost | None:
-        """The frames that ``finish_all`` scored, and the time taken; None: scored nothing."""
-        return Cost(self._frames_scored, self._seconds) if self._frames_scored else None
 
     def finish_all(self, workers: int) -> list[FailedEpisode]:
         """Label all items without a part, ``workers`` at a time, and return the failures.
@@ -87,7 +80,6 @@ class Run:
         Raises RewardError if the server is gone, OSError if the disk is full, after the current episodes have ended.
         """
         pending = unfinished(self._plan, self._parts, self._watch)
-        began_s = time.monotonic()
         with ThreadPoolExecutor(workers, thread_name_prefix="rfm-label") as pool:
             try:
                 list(pool.map(self._label, pending))
@@ -95,7 +87,6 @@ class Run:
                 self._stopping.set()
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
-        self._seconds = time.monotonic() - began_s
         if self._cause is not None:
             raise self._cause
         return by_episode(self._failures)
@@ -128,8 +119,6 @@ class Run:
             raise
         self._check_checkpoint()
         self._parts.write(item, scores.columns, scores.blank)
-        with self._lock:
-            self._frames_scored += item.episode.num_frames
 
     def _check_checkpoint(self) -> None:
         """Stop the run and raise _StoppedError if the server now has another checkpoint."""

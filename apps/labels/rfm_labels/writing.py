@@ -8,7 +8,7 @@ everything that decides the labels, so any run may reuse the part.
 Columns: int64 ``index``, ``episode_index``, ``frame_index``, then float32 ``progress_sparse``, ``success``, and one set
 per camera. If an episode has several tasks, ``progress`` restarts with each task, and ``progress_sparse`` adds up the
 gains. If the model skips frames, ``progress`` is NaN there, and
-``progress_sparse`` is interpolated (NaN with ``--fill none``).
+``progress_sparse`` is interpolated.
 
 ``reward_signals/<name>.parquet``: LeRobot's frame signals (schema version 1), as its open pull requests propose them.
 Columns: the same int64 columns, then float32 ``reward.<name>.progress``, ``reward.<name>.success_probability``, and one
@@ -36,13 +36,11 @@ from rfm_labels.metadata import (
     SCORES,
     SUCCESS,
     Columns,
-    Cost,
     blank_from_metadata,
     blank_to_metadata,
     canonical_json,
     skipping_in,
 )
-from rfm_labels.options import Fill
 from rfm_labels.plan import Item, Plan
 
 IDENTITY = ("index", "episode_index", "frame_index")  # columns in every label table
@@ -50,8 +48,7 @@ PROGRESS_ENDING = "_progress.parquet"
 PROVENANCE_KEY = b"rfm.provenance"
 SIGNALS_PROVENANCE_KEY = b"lerobot.reward_scoring.provenance"
 EPISODES_KEY = b"rfm.episodes"  # digest per episode: a later run compares them to see whether the labels still hold
-FILL_KEY = b"rfm.progress_sparse_fill"  # how skipped frames were filled; absent if the model skipped none
-COST_KEY = b"rfm.cost"  # not in the provenance, which must be equal for equal runs
+FILL_KEY = b"rfm.progress_sparse_fill"  # absent if the model skipped no frame
 SIGNAL_NAMES = {**{name: name for name in SCORES}, SUCCESS: "success_probability", REMAINING: "remaining_time_s"}
 _POTENTIAL, _IS_SCORED = "potential", "is_inference_frame"
 _DERIVED = {  # further signals and what they mean
@@ -204,36 +201,25 @@ class Sidecar:
     metadata: Mapping[bytes, bytes]
 
 
-def progress_file(path: Path, plan: Plan, columns: Sequence[str], cost: Cost | None, fill: Fill) -> Sidecar:
-    """Return the progress file for these part columns.
-
-    cost: None: unknown
-    fill: as in ``LabelOptions``
-    """
+def progress_file(path: Path, plan: Plan, columns: Sequence[str]) -> Sidecar:
+    """Return the progress file for these part columns."""
     checkpoint = plan.recipe.checkpoint
     model = checkpoint.source or checkpoint.weights_digest
     metadata = {
         b"reward_model_path": (f"{model}@{checkpoint.revision}" if checkpoint.revision else model).encode(),
         PROVENANCE_KEY: canonical_json(plan.provenance()),
-        **_of_run(plan, cost),
+        EPISODES_KEY: canonical_json(plan.digests()),
     }
     named = {name: name for name in columns}
-    if is_filled(columns, fill):
-        metadata[FILL_KEY] = fill.encode()
-    if is_filled(columns, fill) or _has_several_tasks(plan):
+    if skipping_in(columns):
+        metadata[FILL_KEY] = b"linear"
+    if skipping_in(columns) or _has_several_tasks(plan):
         return Sidecar(path, {_TOTAL: "progress_sparse", **named}, metadata)
     return Sidecar(path, {**named, PROGRESS: "progress_sparse"}, metadata)
 
 
-def is_filled(columns: Sequence[str], fill: Fill) -> bool:
-    """True if the model skipped frames and ``progress_sparse`` is filled there. columns: from the parts."""
-    return fill == "linear" and skipping_in(columns) is not None
-
-
-def with_totals(labels: Any, plan: Plan, fill: Fill) -> Any:
-    """Return the labels with all columns that the label files need.
-
-    labels: table from ``Parts.read_all``; fill: as in ``LabelOptions``
+def with_totals(labels: Any, plan: Plan) -> Any:
+    """Return the labels, a table from ``Parts.read_all``, with all columns that the label files need.
 
     Reward-aligned behaviour cloning weights a frame by the progress between two frames, or 0 if progress falls.
     Progress restarts when an episode's task changes, so ``progress_sparse`` sums the gains over all tasks. A frame
@@ -250,7 +236,7 @@ def with_totals(labels: Any, plan: Plan, fill: Fill) -> Any:
         derived[_IS_SCORED] = np.isfinite(labels[skipping].to_numpy()).astype(np.float32)
     for name, values in derived.items():
         labels = labels.append_column(name, pa.array(values))
-    if not (is_filled(labels.column_names, fill) or _has_several_tasks(plan)):
+    if not (skipping or _has_several_tasks(plan)):
         return labels
     progress = labels[PROGRESS].to_numpy()
     total, begin = progress.copy(), 0
@@ -260,7 +246,7 @@ def with_totals(labels: Any, plan: Plan, fill: Fill) -> Any:
             own = slice(begin + first, end)
             begun = np.nan_to_num(progress[own.start])  # NaN before the first answer if the model compares frames
             total[own] = progress[own] - begun + total[own.start - 1]
-        if is_filled(labels.column_names, fill):
+        if skipping:
             total[begin:end] = _filled(total[begin:end])
         begin = end
     return labels.append_column(_TOTAL, pa.array(total))
@@ -281,8 +267,8 @@ def _has_several_tasks(plan: Plan) -> bool:
     return any(item.episode.tasks for item in plan.items)
 
 
-def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str, cost: Cost | None) -> Sidecar:
-    """Return the frame signal file for these part columns. cost: None: unknown."""
+def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str) -> Sidecar:
+    """Return the frame signal file for these part columns."""
     signals = {}
     for column in columns:
         score, dot, camera = column.partition(".")
@@ -301,13 +287,7 @@ def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str, cost
     }
     ordered = dict(sorted(signals.items(), key=lambda signal: signal[1]))
     named = {f"lerobot.reward_scoring.{key}".encode(): value for key, value in metadata.items()}
-    return Sidecar(path, ordered, {**named, **_of_run(plan, cost)})
-
-
-def _of_run(plan: Plan, cost: Cost | None) -> dict[bytes, bytes]:
-    """Return the metadata that both formats share."""
-    digests = {EPISODES_KEY: canonical_json(plan.digests())}
-    return digests if cost is None else {**digests, COST_KEY: cost.json()}
+    return Sidecar(path, ordered, {**named, EPISODES_KEY: canonical_json(plan.digests())})
 
 
 def _descriptor(column: str, skipping: str | None) -> dict[str, Any]:
@@ -327,11 +307,9 @@ def _descriptor(column: str, skipping: str | None) -> dict[str, Any]:
 
 
 def write_sidecars(labels: Any, sidecars: Sequence[Sidecar]) -> None:
-    """Write the labels to new files, read them back, then move them into place one by one.
+    """Write the labels, a table from ``with_totals``, to new files, then move them into place one by one.
 
-    labels: table from ``Parts.read_all``
-
-    Raises OSError if a write fails or a file reads back differently; existing files then stay unchanged.
+    Raises OSError if a write fails; existing files then stay unchanged.
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -344,21 +322,4 @@ def write_sidecars(labels: Any, sidecars: Sequence[Sidecar]) -> None:
             own = own.rename_columns([*IDENTITY, *sidecar.columns.values()])
             fields = [pa.field(field.name, field.type, nullable=False) for field in own.schema]
             schema = pa.schema(fields, metadata={**sidecar.metadata, **(labels.schema.metadata or {})})
-            table = own.cast(schema)
-            parquet.write_table(table, file, row_group_size=_ROWS_AT_A_TIME)
-            if not _holds(file, table):
-                raise OSError(f"{sidecar.path}: expected the labels that were written, read others")
-
-
-def _holds(file: Path, table: Any) -> bool:
-    """True if the file's rows, values and metadata equal the table's."""
-    from pyarrow import ArrowException, parquet
-
-    try:
-        read = parquet.ParquetFile(file).read()
-    except ArrowException:
-        return False
-    pairs = zip(read.columns, table.columns, strict=False)
-    return read.schema.equals(table.schema, check_metadata=True) and all(
-        np.array_equal(one.to_numpy(), other.to_numpy(), equal_nan=True) for one, other in pairs
-    )
+            parquet.write_table(own.cast(schema), file, row_group_size=_ROWS_AT_A_TIME)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 LEGEND = (
     "VOC: rank correlation of progress with time, mean over {}. AUROC: of success, by the vote of the last three "
     "frames, and of progress at the last frame; 0.5 is chance. Threshold: of the vote, with the best balanced accuracy."
-    " Falls: steps on which progress falls by more than 0.01. Frames/s: of the run that labelled, with decoding."
+    " Falls: steps on which progress falls by more than 0.01."
 )
 
 
@@ -80,7 +80,7 @@ def evaluate(
 def _print_tables(comparison: LabelComparison) -> None:
     """Print one table for the models, and one for pairwise agreement."""
     known, rows = comparison.is_success, []
-    columns = ["labels", "VOC rho", "VOC tau", "no VOC", "final", "falls", "frames/s"]
+    columns = ["labels", "VOC rho", "VOC tau", "no VOC", "final", "falls"]
     if known is not None:
         columns[5:5] = ["of successes", "of failures", "AUROC success", "AUROC progress", "threshold", "accuracy"]
     for each in comparison.evaluations:
@@ -92,7 +92,7 @@ def _print_tables(comparison: LabelComparison) -> None:
             cells += [number(ranking.auroc if ranking else None, 3) for ranking in (success, progress)]
             cells.append(number(success.threshold if success else None, 3))
             cells.append(number(success.balanced_accuracy if success else None, 3))
-        rows.append([*cells, f"{each.backwards:.1%}", number(each.frames_per_s, 1)])
+        rows.append([*cells, f"{each.backwards:.1%}"])
     counts = f"{len(comparison.episodes)} episodes"
     if known is not None:
         counts += f": {int(known.sum())} successes, {int((~known).sum())} failures"

@@ -299,11 +299,11 @@ class Dataset(ABC):
         """Return the library that decodes the camera's frames, with its version; None: they are stored as pixels."""
 
     @abstractmethod
-    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+    def identity(self, episode: DatasetEpisode, camera: str) -> str:
         """Return a text that identifies the episode's stored frames. Raises DatasetError.
 
-        For a video: size and modification time, or SHA-256 with ``verify``. For pictures in a table: their digest,
-        because other programs also write tables.
+        For a video: size and modification time. For pictures in a table: their digest, because other programs also
+        write tables.
         """
 
     @abstractmethod

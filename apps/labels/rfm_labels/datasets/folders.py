@@ -216,8 +216,8 @@ class VideoFolder(EpisodeFiles):
     def decoder(self, camera: str) -> str | None:
         return Video.decoder()
 
-    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
-        return file_identity(self.root / episode.name, verify=verify)
+    def identity(self, episode: DatasetEpisode, camera: str) -> str:
+        return file_identity(self.root / episode.name)
 
     def check(self, episode: DatasetEpisode, camera: str) -> None:
         """Check nothing more: ``read_episode`` has read all packets."""
@@ -251,8 +251,8 @@ class ArrayFiles(EpisodeFiles):
     def decoder(self, camera: str) -> str | None:
         return None
 
-    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
-        return file_identity(self.root / episode.name, verify=verify)
+    def identity(self, episode: DatasetEpisode, camera: str) -> str:
+        return file_identity(self.root / episode.name)
 
     def check(self, episode: DatasetEpisode, camera: str) -> None:
         file = self.root / episode.name
@@ -302,9 +302,9 @@ class FrameFolders(EpisodeFiles):
     def decoder(self, camera: str) -> str | None:
         return Picture.decoder()
 
-    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+    def identity(self, episode: DatasetEpisode, camera: str) -> str:
         files = self.files(self.root / episode.name, camera)
-        stored = ((file, file_identity(file, verify=verify)) for file in files)
+        stored = ((file, file_identity(file)) for file in files)
         return digest_of(f"{file.name} {identity}{turn_mark(file)}".encode() for file, identity in stored)
 
     def check(self, episode: DatasetEpisode, camera: str) -> None:

@@ -200,7 +200,7 @@ class Hdf5Dataset(Dataset):
     def decoder(self, camera: str) -> str | None:
         return Picture.decoder() if camera in self._firsts else None
 
-    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+    def identity(self, episode: DatasetEpisode, camera: str) -> str:
         with opened_hdf5(self.file) as opened:
             encoded = self._encoded(self._video(opened, episode, camera), episode, camera)
             if encoded is not None:

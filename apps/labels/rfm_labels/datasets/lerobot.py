@@ -120,12 +120,12 @@ class LeRobotDataset(Dataset):
     def decoder(self, camera: str) -> str | None:
         return Video.decoder() if camera in self.info.videos else Picture.decoder()
 
-    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+    def identity(self, episode: DatasetEpisode, camera: str) -> str:
         if camera not in self.info.videos:
             return digest_of(image + turn_mark(image).encode() for image in self._images(episode, camera))
         video, from_s = self._entry(episode.index).video(camera)
         clock = self._clocks[episode.index]
-        return f"{file_identity(video, verify=verify, revision=self.revision)} {from_s}{clock}"
+        return f"{file_identity(video, self.revision)} {from_s}{clock}"
 
     def check(self, episode: DatasetEpisode, camera: str) -> None:
         if camera in self.info.videos:

@@ -119,7 +119,7 @@ class RldsDataset(Dataset):
     def decoder(self, camera: str) -> str | None:
         return Picture.decoder()
 
-    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+    def identity(self, episode: DatasetEpisode, camera: str) -> str:
         return self._record(episode.index).pictures[camera].digest
 
     def check(self, episode: DatasetEpisode, camera: str) -> None:
