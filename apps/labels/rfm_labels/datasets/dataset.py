@@ -314,10 +314,47 @@ class Dataset(ABC):
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         """Yield the T frames in order, uint8 [H, W, 3], as stored, each decoded once. Raises DatasetError."""
 
+    def place(self, episode: DatasetEpisode, camera: str) -> str:
+        """Return where the episode's frames lie, for messages."""
+        return f"{episode.name}: {camera}"
+
     def frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        """Yield the T frames in order, uint8 [H, W, 3], corrected to upright RGB. Raises DatasetError."""
-        correction = self.corrections.get(camera, Correction())
-        return (correction.applied(frame) for frame in self.stored_frames(episode, camera))
+        """Yield the T frames in order, uint8 [H, W, 3], corrected to upright RGB.
+
+        Raises DatasetError, also for frames of different sizes, and in the end for a wrong count.
+        """
+        correction, where = self.corrections.get(camera, Correction()), self.place(episode, camera)
+        count, size = 0, ""
+        for frame in self.stored_frames(episode, camera):
+            own = f"{frame.shape[0]} x {frame.shape[1]} pixels"
+            size = size or own
+            require(f"{where}: frame {count}", own == size, f"a frame of {size}, as the first", own)
+            count += 1
+            if count <= episode.num_frames:
+                yield correction.applied(frame)
+        require(where, count == episode.num_frames, f"{episode.num_frames} frames", count)
+
+
+class CountedDataset(Dataset):
+    """A dataset whose frames are numbered by the order of its episodes. Broken episodes count as empty."""
+
+    @abstractmethod
+    def length(self, number: int) -> int:
+        """Return an episode's frame count. Raises DatasetError."""
+
+    def frames_before(self, number: int) -> int:
+        """Return how many frames the episodes before this one have."""
+        place, counts = self.numbers.index(number), self._frames_before
+        for before in self.numbers[len(counts) - 1 : place]:
+            try:
+                counts.append(counts[-1] + self.length(before))
+            except RewardError:  # raised again if that episode is read
+                counts.append(counts[-1])
+        return counts[place]
+
+    @cached_property
+    def _frames_before(self) -> list[int]:
+        return [0]
 
 
 def iter_episodes(
