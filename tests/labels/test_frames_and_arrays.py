@@ -210,11 +210,6 @@ UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, the opened path, the
         "",
         'got none: write it, or, if all of them have one task, give it: --task "SE',
     ),
-    "a table of before": (
-        ["a.mp4", "tasks.json"],
-        "",
-        "got tasks.json: write it as tasks.csv, with the columns video and",
-    ),
     "an empty folder": ([".hidden"], "", "got an empty folder: put a video, an array or a folder of pictures for each"),
     "other files": (["a.txt"], "", "got other files: put a video, an array or a folder of pictures for each episode"),
     "another file": (["a.txt"], "a.txt", "or a Hub id org/name[@revision], got another file"),

@@ -60,6 +60,25 @@ def faults_at(where: object) -> Iterator[None]:
         raise DatasetError.like(error, where=place) from error
 
 
+def check_pictures(pictures: Iterable[bytes | Path], where: str = "") -> None:
+    """Raise DatasetError unless the headers of these files are those of pictures. where: of contents, for messages"""
+    for place, picture in _placed(pictures, where):
+        with faults_at(place):
+            picture.check()
+
+
+def picture_frames(pictures: Iterable[bytes | Path], where: str = "") -> Iterator[UInt8Array]:
+    """Yield the pixels of these files, uint8 [H, W, 3] each. Raises DatasetError. where: as in ``check_pictures``"""
+    for place, picture in _placed(pictures, where):
+        with faults_at(place):
+            yield picture.pixels()
+
+
+def _placed(pictures: Iterable[bytes | Path], where: str) -> Iterator[tuple[object, Picture]]:
+    for t, picture in enumerate(pictures):
+        yield picture if isinstance(picture, Path) else f"{where}: frame {t}", Picture(picture)
+
+
 @dataclass(frozen=True, eq=False)
 class Span:
     """One episode's T frames in a video.
