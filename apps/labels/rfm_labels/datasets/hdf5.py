@@ -150,8 +150,8 @@ class Hdf5Dataset(CountedDataset):
             of_file = task_of(attributes) if layout.is_in_data else None
             self._demos = {}
             for number, (name, group) in groups.items():
-                task = own_task_of(group) or of_file if layout.is_in_data else task_in(file, opened, group)
-                self._demos[number] = _Demo.read(name, group, task, layout)
+                own = own_task_of(group) or of_file if layout.is_in_data else task_in(file, opened, group)
+                self._demos[number] = _Demo.read(name, group, own, layout)
             self.filter_keys = filter_keys(opened)
             is_libero = layout is ROBOMIMIC and is_of_libero(attributes)
             self.fps = layout.fps or fps_of(attributes)
