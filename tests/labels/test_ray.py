@@ -17,7 +17,7 @@ from rfm_client import ProgressResult, RewardError
 from rfm_client.command_line import ServerOptions
 from rfm_labels import LabelOptions, RayOptions, Scorer, Watch, label, label_with_ray, open_dataset
 from rfm_labels.plan import plan_labels
-from rfm_labels.ray_engine import EpisodeActor, RayJob
+from rfm_labels.ray_engine import EpisodeActor
 from secured import Papers
 
 pytestmark = pytest.mark.filterwarnings(
@@ -53,7 +53,7 @@ def test_an_actor_opens_the_dataset_with_the_given_options_and_keeps_its_scorer_
 
     dataset = open_dataset(ROOT, **told)  # type: ignore[arg-type]
     plan = plan_labels(dataset, scorer, LabelOptions(output=output, limit=3, **FEW))
-    actor = EpisodeActor(RayJob(str(ROOT), told, connect, plan, str(output / "parts"), workers=1))
+    actor = EpisodeActor(str(ROOT), told, connect, plan, str(output / "parts"), workers=1)
     assert actor({"places": [[0, 2]]}) == {"place": [0, 2], "reason": ["", ""]}
     assert actor({"places": [[1]]}) == {"place": [1], "reason": [""]}
     assert scorer.is_open

@@ -24,15 +24,7 @@ from rfm_labels.plan import Plan, checked_episodes, plan_labels
 from rfm_labels.scorer import Scorer
 from rfm_labels.scoring import FailedEpisode, Run
 from rfm_labels.summary import Summary, summary_of
-from rfm_labels.writing import (
-    IDENTITY,
-    PROGRESS_ENDING,
-    Parts,
-    progress_file,
-    signals_file,
-    with_totals,
-    write_sidecars,
-)
+from rfm_labels.writing import PROGRESS_ENDING, Parts, write_labels
 
 
 @dataclass(frozen=True)
@@ -169,12 +161,8 @@ class Outputs:
 
     def write(self, plan: Plan, labels: Any) -> list[Path]:
         """Write the labels, a table from ``Parts.read_all``, to all files, and return their paths. Raises OSError."""
-        columns = [name for name in labels.column_names if name not in IDENTITY]
-        sidecars = [progress_file(path, plan, columns) for path in self.progress]
-        sidecars += [signals_file(path, plan, columns, self.options.name) for path in self.signals]
         try:
-            write_sidecars(with_totals(labels, plan), sidecars)
+            return write_labels(labels, plan, self.progress, self.signals, self.options.name)
         except OSError as error:
             remedy = f"make room, or name another folder with --output and this one's --parts {self.parts.url}"
             raise OSError(f"{self.folder}: expected to write the labels, got {error}: {remedy}") from error
-        return [sidecar.path for sidecar in sidecars]

@@ -88,7 +88,7 @@ class Run:
                 raise
         if self._cause is not None:
             raise self._cause
-        return by_episode(self._failures)
+        return sorted(self._failures, key=lambda failure: failure.episode.index)
 
     def _label(self, item: Item) -> None:
         try:
@@ -112,12 +112,14 @@ class Run:
     def _score(self, item: Item) -> None:
         recipe, memory = self._plan.recipe, self._memory
         try:
-            scores = episode_scores(self._dataset, item.episode, self._scorer, recipe, memory=memory, go_on=self._go_on)
+            columns, blank = episode_scores(
+                self._dataset, item.episode, self._scorer, recipe, memory=memory, go_on=self._go_on
+            )
         except InferenceFailedError:  # perhaps another checkpoint is served now
             self._check_checkpoint()
             raise
         self._check_checkpoint()
-        self._parts.write(item, scores.columns, scores.blank)
+        self._parts.write(item, columns, blank)
 
     def _check_checkpoint(self) -> None:
         """Stop the run and raise _StoppedError if the server now has another checkpoint."""
@@ -145,23 +147,6 @@ def unfinished(plan: Plan, parts: Parts, watch: Watch) -> list[Item]:
     finished = parts.finished(plan.items)
     watch.begin(plan.num_frames, sum(item.episode.num_frames for item in plan.items if item.key in finished))
     return [item for item in plan.items if item.key not in finished]
-
-
-def by_episode(failures: Sequence[FailedEpisode]) -> list[FailedEpisode]:
-    """Return the failures in episode order."""
-    return sorted(failures, key=lambda failure: failure.episode.index)
-
-
-@dataclass(frozen=True, eq=False)
-class EpisodeScores:
-    """The scores for one episode.
-
-    columns: label columns, float32 [T] each
-    blank: brightest value for each camera that shows nothing, as in ``BlankFrames``
-    """
-
-    columns: Columns
-    blank: Mapping[str, int]
 
 
 class FrameMemory:
@@ -197,8 +182,8 @@ def episode_scores(
     *,
     memory: FrameMemory,
     go_on: Callable[[], None],
-) -> EpisodeScores:
-    """Return an episode's scores and blank cameras. Raises RewardError.
+) -> tuple[Columns, dict[str, int]]:
+    """Return an episode's label columns, float32 [T] each, and each blank camera's brightest value. Raises RewardError.
 
     Columns: ``progress``, and every other score in ``SCORES`` that the checkpoint gives; a mark is 1 if it is 1 for any
     camera. Several cameras add ``progress.<camera>`` and so on.
@@ -225,7 +210,7 @@ def episode_scores(
             by_camera.setdefault(camera, []).append(result)
     highest = {camera: frames.highest for camera, frames in shown.items()}
     blank = {camera: value for camera, value in highest.items() if value is not None}
-    return EpisodeScores(_columns(by_camera, episode, recipe), blank)
+    return _columns(by_camera, episode, recipe), blank
 
 
 def _columns(by_camera: Mapping[str, Sequence[ProgressResult]], episode: DatasetEpisode, recipe: Recipe) -> Columns:

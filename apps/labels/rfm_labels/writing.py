@@ -22,9 +22,8 @@ import os
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -55,6 +54,8 @@ _DERIVED = {  # further signals and what they mean
     _POTENTIAL: "Minus the remaining seconds",
     _IS_SCORED: "1 where the model scored the frame itself",
 }
+
+Form: TypeAlias = tuple[Mapping[str, str], Mapping[bytes, bytes]]  # a file's columns by part column, and its metadata
 
 _DIGEST_KEY = b"rfm.digest"
 _SUFFIX = ".parquet"
@@ -188,37 +189,23 @@ def whole_files(*targets: Path) -> Iterator[list[Path]]:
             file.unlink(missing_ok=True)
 
 
-@dataclass(frozen=True)
-class Sidecar:
-    """A Parquet label file to write.
-
-    columns: maps column names in the parts to column names in the file
-    metadata: for the Parquet schema
-    """
-
-    path: Path
-    columns: Mapping[str, str]
-    metadata: Mapping[bytes, bytes]
-
-
-def progress_file(path: Path, plan: Plan, columns: Sequence[str]) -> Sidecar:
-    """Return the progress file for these part columns."""
+def _progress_form(plan: Plan, columns: Sequence[str]) -> Form:
+    """The form of a progress file with these part columns."""
     checkpoint = plan.recipe.checkpoint
     model = checkpoint.source or checkpoint.weights_digest
     metadata = {
         b"reward_model_path": (f"{model}@{checkpoint.revision}" if checkpoint.revision else model).encode(),
         PROVENANCE_KEY: canonical_json(plan.provenance()),
-        EPISODES_KEY: canonical_json(plan.digests()),
     }
     named = {name: name for name in columns}
     if skipping_in(columns):
         metadata[FILL_KEY] = b"linear"
     if skipping_in(columns) or _has_several_tasks(plan):
-        return Sidecar(path, {_TOTAL: "progress_sparse", **named}, metadata)
-    return Sidecar(path, {**named, PROGRESS: "progress_sparse"}, metadata)
+        return {_TOTAL: "progress_sparse", **named}, metadata
+    return {**named, PROGRESS: "progress_sparse"}, metadata
 
 
-def with_totals(labels: Any, plan: Plan) -> Any:
+def _with_totals(labels: Any, plan: Plan) -> Any:
     """Return the labels, a table from ``Parts.read_all``, with all columns that the label files need.
 
     Reward-aligned behaviour cloning weights a frame by the progress between two frames, or 0 if progress falls.
@@ -267,8 +254,8 @@ def _has_several_tasks(plan: Plan) -> bool:
     return any(item.episode.tasks for item in plan.items)
 
 
-def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str) -> Sidecar:
-    """Return the frame signal file for these part columns."""
+def _signals_form(plan: Plan, columns: Sequence[str], name: str) -> Form:
+    """The form of a frame signal file with these part columns."""
     signals = {}
     for column in columns:
         score, dot, camera = column.partition(".")
@@ -287,7 +274,7 @@ def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str) -> S
     }
     ordered = dict(sorted(signals.items(), key=lambda signal: signal[1]))
     named = {f"lerobot.reward_scoring.{key}".encode(): value for key, value in metadata.items()}
-    return Sidecar(path, ordered, {**named, EPISODES_KEY: canonical_json(plan.digests())})
+    return ordered, named
 
 
 def _descriptor(column: str, skipping: str | None) -> dict[str, Any]:
@@ -306,20 +293,29 @@ def _descriptor(column: str, skipping: str | None) -> dict[str, Any]:
     }
 
 
-def write_sidecars(labels: Any, sidecars: Sequence[Sidecar]) -> None:
-    """Write the labels, a table from ``with_totals``, to new files, then move them into place one by one.
+def write_labels(labels: Any, plan: Plan, progress: Sequence[Path], signals: Sequence[Path], name: str) -> list[Path]:
+    """Write the labels to new files, then move them into place one by one. Return all paths.
+
+    labels: table from ``Parts.read_all``
+    progress, signals: files in each format
+    name: reward name, in the signals' column names
 
     Raises OSError if a write fails; existing files then stay unchanged.
     """
     import pyarrow as pa
     from pyarrow import parquet
 
-    for sidecar in sidecars:
-        sidecar.path.parent.mkdir(parents=True, exist_ok=True)
-    with whole_files(*(sidecar.path for sidecar in sidecars)) as files:
-        for file, sidecar in zip(files, sidecars, strict=True):
-            own = labels.select([*IDENTITY, *sidecar.columns])
-            own = own.rename_columns([*IDENTITY, *sidecar.columns.values()])
+    columns = [each for each in labels.column_names if each not in IDENTITY]
+    forms = [(path, _progress_form(plan, columns)) for path in progress]
+    forms += [(path, _signals_form(plan, columns, name)) for path in signals]
+    shared = {EPISODES_KEY: canonical_json(plan.digests()), **(labels.schema.metadata or {})}
+    labels = _with_totals(labels, plan)
+    for path, _ in forms:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_files(*(path for path, _ in forms)) as files:
+        for file, (_, (named, metadata)) in zip(files, forms, strict=True):
+            own = labels.select([*IDENTITY, *named]).rename_columns([*IDENTITY, *named.values()])
             fields = [pa.field(field.name, field.type, nullable=False) for field in own.schema]
-            schema = pa.schema(fields, metadata={**sidecar.metadata, **(labels.schema.metadata or {})})
-            parquet.write_table(own.cast(schema), file, row_group_size=_ROWS_AT_A_TIME)
+            table = own.cast(pa.schema(fields, metadata={**metadata, **shared}))
+            parquet.write_table(table, file, row_group_size=_ROWS_AT_A_TIME)
+    return [path for path, _ in forms]
