@@ -39,9 +39,7 @@ class Info:
     videos, images: cameras with frames in video files, and in tables
     depth: depth cameras among both
     left_out: other cameras, with the reason
-    total_frames: over all episodes
     data_path, video_path: file path templates
-    notes: lines for the caller
     """
 
     root: Path
@@ -51,12 +49,9 @@ class Info:
     images: tuple[str, ...]
     depth: tuple[str, ...]
     left_out: Mapping[str, str]
-    total_episodes: int
-    total_frames: int
     chunks_size: int
     data_path: str
     video_path: str | None
-    notes: Sequence[str]
 
     @classmethod
     def read(cls, root: Path) -> Info:
@@ -67,10 +62,6 @@ class Info:
         except (OSError, ValueError, RecursionError) as error:
             raise DatasetError.at(file, "a readable JSON file", error) from error
         require(file, isinstance(document, dict), "a JSON object", type(document).__name__)
-        notes: list[str] = []
-        if "codebase_version" not in document:
-            document["codebase_version"] = version = "v3.0" if (root / EPISODES_FOLDER).is_dir() else "v2.1"
-            notes = [f"version: {version}, by the files of meta, since info.json has no codebase_version"]
 
         def field(name: str, *kinds: type) -> Any:
             value = document.get(name)
@@ -96,12 +87,9 @@ class Info:
             images,
             depth=tuple(key for key in (*videos, *images) if _is_depth(features[key])),
             left_out=left_out,
-            total_episodes=field("total_episodes", int),
-            total_frames=field("total_frames", int),
             chunks_size=field("chunks_size", int),
             data_path=field("data_path", str),
             video_path=field("video_path", str) if videos else None,
-            notes=notes,
         )
 
     def path(self, template: str | None, **values: Any) -> Path:
@@ -247,23 +235,19 @@ def _entry_v30(info: Info, file: Path, row: dict[str, Any]) -> Entry:
 
 def _video(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float] | DatasetError:
     """A camera's video and the episode's start in it, or a fault, which counts only if the camera is used."""
-    names = [f"videos/{key}/{name}" for name in _VIDEO_COLUMNS]
+    values = {name: row[f"videos/{key}/{name}"] for name in _VIDEO_COLUMNS}
     try:
-        for name in names:
+        for name, value in values.items():
             got = "none: leave this camera out (--cameras), or the episode (--episodes)"
-            require(f"{where}: {name}", row[name] is not None, "a value", got)
-        return _place(info, where, row, key)
+            require(f"{where}: videos/{key}/{name}", value is not None, "a value", got)
+        chunk, number, from_s, to_s = values.values()
+        lasts_s, expected_s = to_s - from_s, row["length"] / info.fps
+        is_long_enough = lasts_s >= expected_s - 0.5 / info.fps  # longer: includes frames from a discarded take
+        expected = f"{expected_s:.4f} s for {row['length']} frames"
+        require(f"{where}: videos/{key}: from_timestamp to to_timestamp", is_long_enough, expected, f"{lasts_s:.4f} s")
+        return info.path(info.video_path, video_key=key, chunk_index=chunk, file_index=number), float(from_s)
     except DatasetError as error:
         return error
-
-
-def _place(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float]:
-    chunk, number, from_s, to_s = (row[f"videos/{key}/{name}"] for name in _VIDEO_COLUMNS)
-    lasts_s, expected_s = to_s - from_s, row["length"] / info.fps
-    is_long_enough = lasts_s >= expected_s - 0.5 / info.fps  # longer: includes frames from a discarded take
-    expected = f"{expected_s:.4f} s for {row['length']} frames"
-    require(f"{where}: videos/{key}: from_timestamp to to_timestamp", is_long_enough, expected, f"{lasts_s:.4f} s")
-    return info.path(info.video_path, video_key=key, chunk_index=chunk, file_index=number), float(from_s)
 
 
 def json_lines(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
