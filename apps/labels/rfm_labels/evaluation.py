@@ -194,8 +194,6 @@ def _episodes(file: Path) -> dict[int, _Scores]:
     table = read_label_table(file)
     require(file, len(table) > 0, "labels", "none")
     episodes = table["episode_index"].to_numpy()
-    has_frames = "frame_index" in table.column_names
-    require(file, has_frames, "the column frame_index", ", ".join(table.column_names))
     frames, progress = table["frame_index"].to_numpy(), table[PROGRESS].to_numpy()
     success = table[SUCCESS].to_numpy() if SUCCESS in table.column_names else None
     scores = {}

@@ -76,7 +76,8 @@ def planned(dataset: Dataset, scorer: Scorer, outputs: Outputs, watch: Watch = Q
             file.check(plan)
         except DatasetError as error:
             if not options.overwrite:
-                problem = f"{error.problem}: choose another {file.option}, or --overwrite"
+                option = "--alias" if file.path in outputs.progress[1:] else "--name"
+                problem = f"{error.problem}: choose another {option}, or --overwrite"
                 raise DatasetError(problem, error.where) from error
             labels = f"its labels of {len(file.digests)} episodes are" if file.digests else "it is"
             watch.note(f"--overwrite: {error}; {labels} replaced")
@@ -155,9 +156,7 @@ class Outputs:
 
     def before(self) -> list[LabelFile]:
         """Return the existing label files."""
-        named = zip(self.progress, ("--name", "--alias"), strict=False)
-        found = [LabelFile.read(path, option) for path, option in named if path.exists()]
-        return found + [LabelFile.read(path) for path in self.signals if path.exists()]
+        return [LabelFile.read(path) for path in (*self.progress, *self.signals) if path.exists()]
 
     def write(self, plan: Plan, labels: Any) -> list[Path]:
         """Write the labels, a table from ``Parts.read_all``, to all files, and return their paths. Raises OSError."""

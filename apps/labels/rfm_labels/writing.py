@@ -97,7 +97,7 @@ class Parts:
     def write(self, item: Item, columns: Columns, blank: Mapping[str, int]) -> None:
         """Write the item's part atomically. Raises OSError.
 
-        columns, blank: as in ``EpisodeScores``
+        columns, blank: as ``episode_scores`` returns them
         """
         import pyarrow as pa
         from pyarrow import parquet
@@ -139,19 +139,16 @@ class Parts:
     def read_all(self, plan: Plan) -> Any:
         """Return a pyarrow Table with the rows for all items in the plan, in order, and the blank cameras as metadata.
 
-        Raises DatasetError if a part is missing, damaged or out of order, or has other columns than the first.
+        Raises DatasetError if a part is missing or damaged, or has other columns than the first.
         """
         import pyarrow as pa
 
         tables: list[Any] = []
         blank: dict[str, dict[int, int]] = {}
-        following = -1
         for item in plan.items:
-            table, name, first = self.read(item), item.episode.name, item.episode.first_index
-            names = (tables or [table])[0].column_names
-            require(name, table.column_names == names, f"the columns {', '.join(names)}", ", ".join(table.column_names))
-            require(name, first > following, f"rows after {following}", first)
-            following = first + item.episode.num_frames - 1
+            table = self.read(item)
+            names, own = (tables or [table])[0].column_names, table.column_names
+            require(item.episode.name, own == names, f"the columns {', '.join(names)}", ", ".join(own))
             for camera, highest in blank_from_metadata(table.schema.metadata).items():
                 blank.setdefault(camera, {}).update(highest)
             tables.append(table.replace_schema_metadata(None))

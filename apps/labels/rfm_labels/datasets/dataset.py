@@ -75,18 +75,15 @@ class AskedCorrections:
         channels: ChannelOrder | Mapping[str, ChannelOrder] | None,
     ) -> AskedCorrections:
         """Accept a value for all cameras or by camera; None: not given. Raises DatasetError for an unknown value."""
-        asked = cls(
-            {"": orient} if isinstance(orient, str) else orient or {},
-            {"": channels} if isinstance(channels, str) else channels or {},
-        )
-        try:
-            for turn in asked.orient.values():
-                Correction(orient=turn)
-            for order in asked.channels.values():
-                Correction(channels=order)
-        except ConfigError as error:
-            raise DatasetError.like(error) from None
-        return asked
+        asked: dict[str, Any] = {}
+        for option, given in (("orient", orient), ("channels", channels)):
+            asked[option] = {"": given} if isinstance(given, str) else given or {}
+            try:
+                for value in asked[option].values():
+                    Correction(**{option: value})
+            except ConfigError as error:
+                raise DatasetError.like(error) from None
+        return cls(**asked)
 
     def of_cameras(
         self,
@@ -99,11 +96,8 @@ class AskedCorrections:
         turns: default orientations, unless the caller gives one
         orders: default channel orders, unless the caller gives one
         """
-        orient = {**({} if "" in self.orient else turns or {}), **_known("orient", self.orient, cameras)}
-        channels = {
-            **({} if "" in self.channels else orders or {}),
-            **_known("channels", self.channels, cameras),
-        }
+        orient = {**(turns or {}), **_known("orient", self.orient, cameras)}
+        channels = {**(orders or {}), **_known("channels", self.channels, cameras)}
         found = {camera: Correction.of(camera, orient, channels) for camera in cameras}
         return {camera: correction for camera, correction in found.items() if correction != Correction()}
 

@@ -279,11 +279,6 @@ def _found(folder: Path) -> dict[str, list[str]]:
     return {kind: in_natural_order(names) for kind, names in found.items() if names}
 
 
-def _is_visible(file: Path) -> bool:
-    """True for a file, but not for a hidden one, as macOS adds."""
-    return file.is_file() and not file.name.startswith(".")
-
-
 def _is_frame(file: Path) -> bool:
     return is_picture(file) and not _OUR_FILES.fullmatch(file.name)
 
@@ -308,7 +303,8 @@ def _unread(path: Path) -> str | None:
     if any(_is_frame(file) for file in path.iterdir()):
         return "pictures outside of the folder of an episode"
     suffixes = {**dict.fromkeys(_VIDEO_SUFFIXES, "videos"), **dict.fromkeys(PICTURE_SUFFIXES, "pictures")}
-    deeper = next((file for file in path.rglob("*") if file.suffix.lower() in suffixes and _is_visible(file)), None)
+    shown = (file for file in path.rglob("*") if file.is_file() and not file.name.startswith("."))
+    deeper = next((file for file in shown if file.suffix.lower() in suffixes), None)
     if deeper is None:
         return None
     kind = suffixes[deeper.suffix.lower()]
