@@ -73,7 +73,6 @@ def test_the_last_three_frames_decide_who_succeeds_and_an_undone_success_is_a_cl
         assert scores.succeeded(last=3) == (voted_success(scores.success) >= 0.5)
     done = rfm_client("label", file, "--report")
     assert done.exit_code == 0, done.output
-    assert (tmp_path / "rfm_summary.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_of_two_thresholds_that_are_equally_good_the_lower_counts(tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def test_topreward_s_table_is_that_of_lerobot(tmp_path: Path, run: dict[str, Any
 
 
 def check(file: Path, words: list[Any], run: dict[str, Any], atol: float) -> None:
-    done = rfm(*words, "--no-picture")
+    done = rfm(*words)
     assert done.exit_code == 0, done.output
     table = parquet.read_table(file)
     for name in ("index", "episode_index", "frame_index"):

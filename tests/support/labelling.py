@@ -109,7 +109,7 @@ def command(
 ) -> int:
     """Run ``rfm-client label`` with a scorer instead of a server. Return the exit code.
 
-    say: gets each line of its output; run: ``dry_run``, ``picture``
+    say: gets each line of its output; run: ``dry_run``
     """
     from rfm_labels.commands.label import EpisodeTexts, LabelCommand, RunOptions
 
