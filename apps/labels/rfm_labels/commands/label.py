@@ -256,11 +256,11 @@ class LabelCommand:
                 unused.append(error)
                 command = replace(command, texts=replace(command.texts, task=None))
             except RewardError as error:
-                messages = error.lines if isinstance(error, FaultsError) else [str(error)]
+                messages = str(error).splitlines() if isinstance(error, FaultsError) else [str(error)]
                 lines += [line if command.source in line else f"{command.source}: {line}" for line in messages]
             checked.append(command)
         if lines:
-            raise FaultsError.listing(lines)
+            raise FaultsError("\n".join(lines))
         if len(unused) == len(commands):
             raise unused[0]
         return checked

@@ -52,16 +52,7 @@ class UnusedTaskError(DatasetError):
 
 
 class FaultsError(DatasetError):
-    """Several faults, one per line, then the options that help. lines: the message's lines."""
-
-    lines: tuple[str, ...] = ()
-
-    @classmethod
-    def listing(cls, lines: Sequence[str]) -> FaultsError:
-        """Return the error with these lines."""
-        error = cls("\n".join(lines))
-        error.lines = tuple(lines)
-        return error
+    """Several faults, one per line, then the options that help."""
 
     @classmethod
     def of(cls, faults: Mapping[int, RewardError], numbers: Sequence[int]) -> FaultsError:
@@ -81,7 +72,7 @@ class FaultsError(DatasetError):
         others = [number for number in numbers if number not in faults]
         if others:
             lines.append(f"to continue without the faulty episodes: --episodes {listed(others)}")
-        return cls.listing(lines)
+        return cls("\n".join(lines))
 
 
 require = partial(require_that, error=DatasetError)

@@ -20,7 +20,6 @@ from rfm_client.frames import Orientation, Picture
 from rfm_labels.datasets.dataset import AskedCorrections, CountedDataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, FaultsError, require
 from rfm_labels.datasets.hdf5_layouts import (
-    DOCUMENTS,
     ROBOMIMIC,
     ROBOTWIN,
     Layout,
@@ -31,8 +30,6 @@ from rfm_labels.datasets.hdf5_layouts import (
     is_of_libero,
     layout_of,
     opened_hdf5,
-    own_task_of,
-    task_in,
     task_of,
     task_places,
 )
@@ -147,11 +144,10 @@ class Hdf5Dataset(CountedDataset):
             self._layout = layout = layout_of(opened)
             groups = layout.episodes(file, opened)
             attributes = (opened["data"] if layout.is_in_data else opened).attrs
-            of_file = task_of(attributes) if layout.is_in_data else None
-            self._demos = {}
-            for number, (name, group) in groups.items():
-                own = own_task_of(group) or of_file if layout.is_in_data else task_in(file, opened, group)
-                self._demos[number] = _Demo.read(name, group, own, layout)
+            self._demos = {
+                number: _Demo.read(name, group, task_of(file, opened, group, layout), layout)
+                for number, (name, group) in groups.items()
+            }
             self.filter_keys = filter_keys(opened)
             is_libero = layout is ROBOMIMIC and is_of_libero(attributes)
             self.fps = layout.fps or fps_of(attributes)
@@ -201,8 +197,7 @@ class Hdf5Dataset(CountedDataset):
     def read_episode(self, number: int) -> DatasetEpisode:
         demo = self._demos[number]
         where = f"{self.file}: {self._layout.group_of(demo.name)}".removesuffix(": ")
-        places = f"ep_meta, or data: {' or '.join(DOCUMENTS)}" if self._layout.is_in_data else task_places(self.file)
-        task = self.given_task.of(f"{where}: {places}", demo.task)
+        task = self.given_task.of(f"{where}: {task_places(self.file, self._layout)}", demo.task)
         counts = ", ".join(f"{key} {count}" for key, count in demo.counts(self.cameras).items())
         require(where, self.length(number) > 0, "one length, above 0", counts or _described(demo.forms))
         return DatasetEpisode(number, demo.name, task, self.length(number), self.frames_before(number))

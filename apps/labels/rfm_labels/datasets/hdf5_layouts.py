@@ -77,20 +77,6 @@ def texts_in(stored: Any) -> list[str] | None:
     return [value.decode(errors="replace") if isinstance(value, bytes) else str(value) for value in values]
 
 
-def own_task_of(demo: Any) -> Any:
-    """Read a demonstration's task from ``ep_meta``, as robomimic does, or from an attribute; None without one."""
-    attributes = getattr(demo, "attrs", {})
-    stored = document(attributes, "ep_meta")
-    own = next((stored[key] for key in _SENTENCES if stored.get(key)), None)
-    return own or next((attribute(attributes, key) for key in _SENTENCES if key in attributes), None)
-
-
-def task_of(attributes: Mapping[str, Any]) -> Any:
-    """Read the task for all demonstrations from the attributes on ``data``; None if there is none."""
-    documents = (document(attributes, name) for name in DOCUMENTS)
-    return next((found[key] for found in documents for key in _SENTENCES if found.get(key)), None)
-
-
 def is_of_libero(attributes: Mapping[str, Any]) -> bool:
     """True if the attributes on ``data`` are LIBERO's."""
     env_names = [attribute(attributes, "env_name"), document(attributes, "env_args").get("env_name")]
@@ -283,17 +269,29 @@ def layout_of(opened: Any) -> Layout:
     return _MANISKILL if "data" not in opened and any(map(_TRAJECTORY.fullmatch, opened)) else ROBOMIMIC
 
 
-def task_places(file: Path) -> str:
-    """Return where ``task_in`` looks, for messages."""
+def task_places(file: Path, layout: Layout) -> str:
+    """Return where ``task_of`` looks, for messages."""
+    if layout.is_in_data:
+        return f"ep_meta, or data: {' or '.join(DOCUMENTS)}"
     return f"attribute or dataset {', '.join(_TASK_NAMES)}, or RoboTwin's instructions/{file.stem}.json"
 
 
-def task_in(file: Path, opened: Any, episode: Any) -> Any:
-    """Read an episode's task from attributes, a dataset, or RoboTwin's side file; None without one."""
-    found = own_task_of(episode)
+def task_of(file: Path, opened: Any, episode: Any, layout: Layout) -> Any:
+    """Read an episode's task; None without one.
+
+    First from its attributes, as robomimic does (``ep_meta``); then from those of ``data``, or for an episode outside
+    of ``data`` from other attributes, a dataset, or RoboTwin's side file.
+    """
+    attributes = getattr(episode, "attrs", {})
+    stored = document(attributes, "ep_meta")
+    found = next((stored[key] for key in _SENTENCES if stored.get(key)), None)
+    found = found or next((attribute(attributes, key) for key in _SENTENCES if key in attributes), None)
+    if layout.is_in_data:
+        documents = [document(opened["data"].attrs, name) for name in DOCUMENTS]
+        return found or next((each[key] for each in documents for key in _SENTENCES if each.get(key)), None)
     for name in _TASK_NAMES:
-        found = found or attribute(getattr(episode, "attrs", {}), name) or _one(texts_in(opened.get(name)))
-    return found or next(iter(instructions_of(file) if layout_of(opened) is ROBOTWIN else ()), None)
+        found = found or attribute(attributes, name) or _one(texts_in(opened.get(name)))
+    return found or next(iter(instructions_of(file) if layout is ROBOTWIN else ()), None)
 
 
 def _one(texts: list[str] | None) -> Any:

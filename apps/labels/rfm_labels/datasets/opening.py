@@ -105,7 +105,7 @@ def read_table_of_tasks(table: Path, *, has_tasks: bool) -> Mapping[str, str | N
         where = f"{table}: line {rows.line_num}"
         raise DatasetError.at(where, 'quotes around a whole cell, and "" for a quote in it', error) from error
     if faults:
-        raise FaultsError.listing(shortened(faults))
+        raise FaultsError("\n".join(shortened(faults)))
     require(table, bool(tasks), "at least one video", "none")
     return tasks
 

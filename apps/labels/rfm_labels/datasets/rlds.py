@@ -84,14 +84,12 @@ class RldsDataset(CountedDataset):
         self.source, self.given_task, self.notes = info.source, task, info.notes
         self.cameras, self.left_out = tuple(info.cameras), info.left_out
         self.corrections = corrections.of_cameras(self.cameras)
-        files = [RecordFile(each.file, each.num_episodes) for each in info.shards]
-        counts = [each.num_episodes for each in info.shards]
-        self._places = [(file, n) for file, count in zip(files, counts, strict=True) for n in range(count)]
-        splits = [each.split for each in info.shards for _ in range(each.num_episodes)]
+        self._places: list[tuple[RecordFile, int]] = []
+        self.filter_keys = keys = {split: list[int]() for split, _ in info.files}
+        for split, file in info.files:
+            keys[split] += range(len(self._places), len(self._places) + file.num_records)
+            self._places += [(file, number) for number in range(file.num_records)]
         self.numbers = range(len(self._places))
-        self.filter_keys = {
-            split: [number for number in self.numbers if splits[number] == split] for split in dict.fromkeys(splits)
-        }
         self._records: dict[int, _Record] = {}
 
     def length(self, number: int) -> int:
