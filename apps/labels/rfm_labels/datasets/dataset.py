@@ -223,7 +223,14 @@ class Dataset(ABC):
     @cached_property
     def episodes(self) -> Sequence[DatasetEpisode]:
         """All episodes, by index. Raises DatasetError with every episode's faults."""
-        episodes = self.read(self.numbers)
+        episodes, faults = [], {}
+        for number in self.numbers:
+            try:
+                episodes.append(self.episode(number))
+            except RewardError as fault:
+                faults[number] = fault
+        if faults:
+            raise FaultsError.of(faults, self.numbers)
         self.given_task.check_used(episodes)
         return episodes
 
@@ -232,18 +239,6 @@ class Dataset(ABC):
         if number not in self._read:
             self._read[number] = self.read_episode(number)
         return self._read[number]
-
-    def read(self, numbers: Sequence[int]) -> list[DatasetEpisode]:
-        """Return the episodes with these numbers. Raises FaultsError."""
-        episodes, faults = [], {}
-        for number in numbers:
-            try:
-                episodes.append(self.episode(number))
-            except RewardError as fault:
-                faults[number] = fault
-        if faults:
-            raise FaultsError.of(faults, numbers)
-        return episodes
 
     @cached_property
     def _read(self) -> dict[int, DatasetEpisode]:

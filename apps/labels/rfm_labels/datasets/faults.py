@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rfm_client import RewardError
 from rfm_client.options import InvalidValueError, git_lfs_pointer
@@ -41,6 +43,16 @@ def unreadable(file: Path, expected: str, error: object) -> DatasetError:
     with suppress(OSError):
         error = (git_lfs_pointer(file) if file.is_file() else "") or error
     return DatasetError.at(file, expected, error)
+
+
+def json_object(file: Path) -> dict[str, Any]:
+    """Read a JSON file. Raises DatasetError unless it holds an object."""
+    try:
+        document = json.loads(file.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise DatasetError.at(file, "a readable JSON file", error) from error
+    require(file, isinstance(document, dict), "a JSON object", type(document).__name__)
+    return dict(document)
 
 
 class MissingTaskError(DatasetError):

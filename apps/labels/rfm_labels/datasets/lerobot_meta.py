@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rfm_client.options import checked_count
-from rfm_labels.datasets.faults import DatasetError, require, unreadable
+from rfm_labels.datasets.faults import DatasetError, json_object, require, unreadable
 
 INFO_FILE = Path("meta", "info.json")
 VERSIONS = ("v2.0", "v2.1", "v3.0")
@@ -57,11 +57,7 @@ class Info:
     def read(cls, root: Path) -> Info:
         """Read the information in ``root``. Raises DatasetError."""
         file = root / INFO_FILE
-        try:
-            document = json.loads(file.read_bytes())
-        except (OSError, ValueError, RecursionError) as error:
-            raise DatasetError.at(file, "a readable JSON file", error) from error
-        require(file, isinstance(document, dict), "a JSON object", type(document).__name__)
+        document = json_object(file)
 
         def field(name: str, *kinds: type) -> Any:
             value = document.get(name)

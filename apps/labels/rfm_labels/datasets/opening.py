@@ -59,13 +59,14 @@ _UNREAD = {  # remedies for layouts without a reader, by file name pattern
     r".*\.(bag|mcap|db3)": f"a rosbag: {_CONVERT}",
 }
 _VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov", ".webm", ".avi")
-_SUFFIXES = {"videos": _VIDEO_SUFFIXES, "arrays": ARRAY_SUFFIXES}  # for episodes that are files
+_SUFFIXES = {"videos": _VIDEO_SUFFIXES, "arrays": ARRAY_SUFFIXES, "HDF5 files": SUFFIXES, "pictures": PICTURE_SUFFIXES}
 _KINDS: dict[str, tuple[type[EpisodeFiles], str]] = {  # reader, and what an episode is called
     "videos": (VideoFolder, "video"),
     "folders of pictures": (FrameFolders, "folder"),
     "arrays": (ArrayFiles, "file"),
     "recordings of Unitree": (UnitreeFolders, "folder"),
 }
+_ORDER = ("videos", "arrays", "HDF5 files", "recordings of Unitree", "folders of pictures", "pictures")
 _OWN_TASKS = ("arrays", "recordings of Unitree")
 _OUR_FILES = re.compile(r".*_summary\.png")  # beside labelled episodes
 
@@ -214,7 +215,8 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
     if table.is_file():
         tasks = read_table_of_tasks(table, has_tasks=task.text is None)
         there = [name for name in tasks if (table.parent / name).exists()] or list(tasks)
-        kinds = {_kind_of(table.parent / name): name for name in reversed(there)}
+        found = {_kind_of(table.parent / name): name for name in reversed(there)}
+        kinds = {kind if kind in _KINDS else "videos": name for kind, name in found.items()}
         examples = " and ".join(f"{kind} ({name})" for kind, name in sorted(kinds.items()))
         require(table, len(kinds) == 1, "episodes of one kind", f"{examples}: write a table for each kind")
         (kind,) = kinds
@@ -242,10 +244,11 @@ def _unlisted(table: Path, kind: str, names: Collection[str]) -> list[str]:
     return [note] if gone else []
 
 
-def _kind_of(path: Path) -> str:
+def _kind_of(path: Path) -> str | None:
+    """What an episode's file or folder is, by name; None: another file."""
     if path.is_dir() or is_pattern(path):
         return "recordings of Unitree" if is_of_unitree(path) else "folders of pictures"
-    return "arrays" if path.suffix.lower() in ARRAY_SUFFIXES else "videos"
+    return next((kind for kind, suffixes in _SUFFIXES.items() if path.suffix.lower() in suffixes), None)
 
 
 def _listed(folder: Path) -> tuple[str, list[str]]:
@@ -262,21 +265,15 @@ def _listed(folder: Path) -> tuple[str, list[str]]:
 
 def _found(folder: Path) -> dict[str, list[str]]:
     """Names that may be episodes, by kind, without hidden files and label files."""
-    shown = [folder / name for name in _names_in(folder)]
-    files = [each for each in shown if each.is_file() and not _OUR_FILES.fullmatch(each.name)]
-    folders = [each for each in shown if each.is_dir() and each.name != SIGNALS_FOLDER]
-    found = {
-        kind: [each.name for each in files if each.suffix.lower() in suffixes]
-        for kind, suffixes in (*_SUFFIXES.items(), ("HDF5 files", SUFFIXES))
-    }
-    of_unitree = [each for each in folders if is_of_unitree(each)]
-    folders = [each for each in folders if each not in of_unitree]
-    found["recordings of Unitree"] = [each.name for each in of_unitree]
-    has_frames = any(_is_frame(file) for each in folders for file in each.iterdir())
-    found["folders of pictures"] = [each.name for each in folders] if has_frames else []
-    if has_frames or not any(found.values()):  # elsewhere a picture is no frame
-        found["pictures"] = [each.name for each in files if _is_frame(each)]
-    return {kind: in_natural_order(names) for kind, names in found.items() if names}
+    names = [name for name in in_natural_order(_names_in(folder)) if name != SIGNALS_FOLDER]
+    kinds = {name: _kind_of(folder / name) for name in names if not _OUR_FILES.fullmatch(name)}
+    found = {kind: [name for name in kinds if kinds[name] == kind] for kind in _ORDER}
+    folders = [folder / name for name in found["folders of pictures"]]
+    if not any(_is_frame(file) for each in folders for file in each.iterdir()):
+        found["folders of pictures"] = []
+        if any(found[kind] for kind in found if kind != "pictures"):  # a picture beside other episodes is no frame
+            found["pictures"] = []
+    return {kind: names for kind, names in found.items() if names}
 
 
 def _is_frame(file: Path) -> bool:

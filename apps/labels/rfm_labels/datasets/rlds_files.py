@@ -10,7 +10,6 @@ Format: tensorflow/core/lib/io/record_writer.h and tensorflow/core/example/examp
 
 from __future__ import annotations
 
-import json
 import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,7 +20,7 @@ from typing import Any, BinaryIO
 
 from rfm_client.options import git_lfs_pointer
 from rfm_labels.datasets.dataset import LEAST_SIZE_PX
-from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.datasets.faults import DatasetError, json_object, require
 
 NEEDED = 'RLDS datasets need google-crc32c and protobuf: pip install ./client "./apps/labels[rlds]"'
 _HEAD = struct.Struct("<QI")
@@ -170,7 +169,7 @@ class RldsInfo:
 
         task_column: feature with the task, or the last part of its path; None: those in ``INSTRUCTIONS``
         """
-        info = _document(root / _INFO_FILE)
+        info = json_object(root / _INFO_FILE)
         features = _features(root / FEATURES_FILE)
         shown = {name.removeprefix(_OBSERVATION): each for name, each in features.items() if _shown(name, each)}
         faults = {name: _fault(each) for name, each in shown.items()}
@@ -191,15 +190,6 @@ class RldsInfo:
             instructions=instructions,
             notes=[f"tasks: from {first}, where it is blank from {', '.join(others)}"] if others else [],
         )
-
-
-def _document(file: Path) -> Mapping[str, Any]:
-    try:
-        found = json.loads(file.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
-        raise DatasetError.at(file, "a readable JSON file of TensorFlow Datasets", error) from error
-    require(file, isinstance(found, dict), "a JSON object", type(found).__name__)
-    return dict(found)
 
 
 def _files(root: Path, info: Mapping[str, Any]) -> list[tuple[str, RecordFile]]:
@@ -233,7 +223,7 @@ def _features(file: Path) -> Mapping[str, Mapping[str, Any]]:
     """The features with values, by path. Raises DatasetError."""
     expected = "features as TensorFlow Datasets 4.6 or later writes them"
     try:
-        features = dict(_leaves(_document(file)))
+        features = dict(_leaves(json_object(file)))
         for feature in features.values():
             _shape(feature.get("image", feature.get("tensor", {})))
     except (AttributeError, TypeError, ValueError) as error:
