@@ -131,8 +131,7 @@ def write_demos(file: Path, task: str) -> None:
 def asked(source: Path, labels: LabelOptions, *, dry_run: bool = False) -> tuple[int, list[str], set[str]]:
     """Return the exit code, the output lines, and the scored tasks."""
     scorer, said = BrightnessScorer(), list[str]()
-    picture = not source.joinpath("task_2.rfm_summary.png").exists()
-    return command(source, labels, scorer, said.append, dry_run=dry_run, picture=picture), said, scorer.tasks
+    return command(source, labels, scorer, said.append, dry_run=dry_run), said, scorer.tasks
 
 
 def test_a_folder_of_hdf5_files_is_labelled_file_by_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -144,7 +143,6 @@ def test_a_folder_of_hdf5_files_is_labelled_file_by_file(tmp_path: Path, capsys:
     files = [f"{root}/more/task_1.h5", f"{root}/task_2.hdf5", f"{root}/task_10.hdf5"]
     assert [line for line in said if line in files] == files
     for folder, stem in (("more", "task_1"), ("", "task_2"), ("", "task_10")):
-        assert (root / folder / f"{stem}.rfm_summary.png").exists()
         labels = read_episode_labels(root / folder / f"{stem}.rfm_progress.parquet", 0)
         assert labels is not None
         np.testing.assert_allclose(labels.fused.progress, brightness(numbered(5)), atol=1e-6)
@@ -209,11 +207,6 @@ UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, the opened path, the
         ["a.mp4"],
         "",
         'got none: write it, or, if all of them have one task, give it: --task "SE',
-    ),
-    "a table of before": (
-        ["a.mp4", "tasks.json"],
-        "",
-        "got tasks.json: write it as tasks.csv, with the columns video and",
     ),
     "an empty folder": ([".hidden"], "", "got an empty folder: put a video, an array or a folder of pictures for each"),
     "other files": (["a.txt"], "", "got other files: put a video, an array or a folder of pictures for each episode"),

@@ -267,7 +267,6 @@ def test_labels_of_two_files_in_a_folder_are_kept_apart(three: Path) -> None:
         assert find_label_files(file) == [file.with_name(f"{file.stem}.mine_progress.parquet")]
         shown = invoke("label", file, "--report", "--name", "mine")
         assert shown.exit_code == 0, shown.stderr
-        assert str(file.with_name(f"{file.stem}.mine_summary.png")) in shown.stdout.replace("\n", "")
     assert invoke("evaluate", three).exit_code == 0
     shown = invoke("label", three, "--report", "--name", "gone")
     assert "demos.gone_progress.parquet: expected a file of labels, got none: label the dataset first" in shown.stderr
@@ -296,9 +295,9 @@ REFUSED: dict[str, tuple[Callable[[Any], object], str]] = {
     ),
     "an attribute that is no JSON": (
         told("data", "env_args", "{'env_name': 'Lift'}"),
-        f"{NO_TASK}problem_info or env_args (no JSON object): expected a task as a sentence, got none",
+        f"{NO_TASK}problem_info or env_args: expected a task as a sentence, got none",
     ),
-    "an attribute of numbers": (told("data", "env_args", [1, 2]), "env_args (no JSON object): expected a task as a se"),
+    "an attribute of numbers": (told("data", "env_args", [1, 2]), "env_args: expected a task as a sentence, got none"),
     "fewer actions than frames": (put("data/demo_1/actions", np.zeros((3, 7))), "got obs/front 5, actions 3"),
 }
 
@@ -344,23 +343,9 @@ def masks(opened: Any) -> None:
 
 
 NOTES: dict[str, tuple[Callable[[Any], object], list[str]]] = {
-    "groups with other names": (
-        others,
-        ["left out: data/demo_0_rollout, data/demo_a, rollouts: demonstrations are data/demo_<number>"],
-    ),
-    "filter keys of others": (
-        masks,
-        [
-            "left out: mask/lost: expected names of demonstrations, got no text",
-            "left out: mask/numbers: expected names of demonstrations, got 0, 1",
-            "left out: mask/others: expected names of demonstrations, got demo_00",
-        ],
-    ),
+    "groups with other names": (others, []),
+    "filter keys of others": (masks, []),
     "an observation after the last action": (put("data/demo_2/actions", np.zeros((NUM_FRAMES - 1, 7))), []),
-    "another number of samples": (
-        told("data/demo_1", "num_samples", 7),
-        ["lengths: num_samples differs: demo_1 (7, has 5): each observation gets a label"],
-    ),
     "a camera whose frames lie in other files": (
         lambda opened: opened.create_virtual_dataset("data/demo_0/obs/wrist", h5py.VirtualLayout(FRAMES.shape, "u1")),
         ["left out: wrist: a virtual dataset: copy its frames into the file"],
@@ -373,10 +358,7 @@ NOTES: dict[str, tuple[Callable[[Any], object], list[str]]] = {
         put("data/demo_0/obs/all", h5py.SoftLink("/data/demo_0/obs")),
         ["left out: all: a group: expected its pictures one level up"],
     ),
-    "an attribute that is no JSON": (
-        told("data", "problem_info", b"libero"),
-        ["data: problem_info is not a JSON object, so it states neither a task nor LIBERO"],
-    ),
+    "an attribute that is no JSON": (told("data", "problem_info", b"libero"), []),
     "one sentence in an array": (told("data/demo_0", "language", np.array(["close it"], object)), []),
     "no text": (told("data/demo_0", "language", h5py.Empty("S4")), []),
     "numbers of another form": (put("data/demo_0/obs/point", np.zeros(NUM_FRAMES, [("x", "f4"), ("y", "f4")])), []),

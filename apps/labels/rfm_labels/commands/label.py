@@ -16,7 +16,7 @@ from rfm_client import RewardError
 from rfm_client.command_line import ExitCode, ServerOptions, print_table, report, with_options
 from rfm_client.frames import ChannelOrder, Orientation
 from rfm_client.options import ConfigError, Settings, setting
-from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset, DatasetEpisode, SeveralTasks, parsed_by_camera
+from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, SeveralTasks, parsed_by_camera
 from rfm_labels.datasets.faults import FaultsError, UnusedTaskError, listed, require
 from rfm_labels.datasets.hdf5 import label_prefix
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
@@ -29,7 +29,7 @@ from rfm_labels.options import LabelOptions, RayOptions, Watch
 from rfm_labels.plan import checked_episodes
 from rfm_labels.ray_engine import Connect, label_with_ray
 from rfm_labels.scorer import ClientScorer, Scorer
-from rfm_labels.summary import Summary, summarise
+from rfm_labels.summary import summarise
 
 SPEED_OVER_S = 600.0  # an episode may take minutes
 Printer: TypeAlias = Callable[[str], None]
@@ -66,6 +66,7 @@ class ProgressBar(Watch):
             disable=not console.is_terminal,
             speed_estimate_period=SPEED_OVER_S,
         )
+        self._shown = self._bar.add_task("", visible=False)
         self.num_begun = 0
 
     def __enter__(self) -> ProgressBar:
@@ -85,7 +86,7 @@ class ProgressBar(Watch):
 
     def checked(self, episode: DatasetEpisode) -> None:
         """Advance the bar by an episode."""
-        self._advance(1)
+        self._bar.advance(self._shown)
 
     def begin(self, num_frames: int, num_finished: int) -> None:
         """Start counting labelled frames."""
@@ -96,22 +97,16 @@ class ProgressBar(Watch):
 
     def scored(self, episode: DatasetEpisode) -> None:
         """Advance the bar by the episode's frames."""
-        self._advance(episode.num_frames)
+        self._bar.advance(self._shown, episode.num_frames)
 
     def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
         """Write a line with the reason."""
         text = str(error)
         self._say(text if text.startswith(episode.name) else f"{episode.name}: {text}")
-        self._advance(episode.num_frames)
+        self.scored(episode)
 
     def _begin(self, text: str, total: int, completed: int) -> None:
-        for task in self._bar.task_ids:
-            self._bar.remove_task(task)
-        self._bar.add_task(text, total=total, completed=completed)
-
-    def _advance(self, by: int) -> None:
-        for task in self._bar.task_ids:
-            self._bar.advance(task, by)
+        self._bar.reset(self._shown, description=text, total=total, completed=completed, visible=True)
 
 
 @dataclass(frozen=True)
@@ -167,14 +162,13 @@ class EpisodeTexts(Settings):
 
 @dataclass(frozen=True)
 class RunOptions(Settings):
-    """Engine, trial run and summary of a labelling command."""
+    """Engine, trial run and report of a labelling command."""
 
     TITLE: ClassVar[str] = "Run"
 
     engine: Literal["threads", "ray"] = setting("threads", "threads: in this process. ray: by actors of a Ray cluster.")
     dry_run: bool = setting(False, "Check everything, count, write nothing.")
     report: bool = setting(False, "Only show the summary of labels that are there.")
-    picture: bool = setting(True, "Draw the summary: NAME_summary.png in the output.")
 
 
 @with_options
@@ -262,11 +256,11 @@ class LabelCommand:
                 unused.append(error)
                 command = replace(command, texts=replace(command.texts, task=None))
             except RewardError as error:
-                messages = error.lines if isinstance(error, FaultsError) else [str(error)]
+                messages = str(error).splitlines() if isinstance(error, FaultsError) else [str(error)]
                 lines += [line if command.source in line else f"{command.source}: {line}" for line in messages]
             checked.append(command)
         if lines:
-            raise FaultsError.listing(lines)
+            raise FaultsError("\n".join(lines))
         if len(unused) == len(commands):
             raise unused[0]
         return checked
@@ -314,7 +308,7 @@ class LabelCommand:
         if report.summary is None:
             self.say(f"this shard is labelled; the same command without --shard writes the files from {report.parts}")
             return ExitCode.OK
-        self._show(report.summary, report.files[0])
+        _print(report.summary.rows())
         for file in report.files:
             typer.echo(f"{file}")
         return ExitCode.OK
@@ -330,18 +324,7 @@ class LabelCommand:
         summary = summarise(path)
         for line in blank_lines(read_blank(path), len(summary.episodes)):
             self.say(f"note: {line}")
-        self._show(summary, path)
-
-    def _show(self, summary: Summary, file: Path) -> None:
         _print(summary.rows())
-        if self.options.picture:
-            from rfm_labels.pictures import draw_summary
-
-            beside = file.parent.parent if file.parent.name == SIGNALS_FOLDER else file.parent
-            named = f"{label_prefix(Path(self.source))}{self.labels.name}_summary.png"
-            picture = (self.labels.output or beside) / named
-            draw_summary(picture, summary, file)
-            typer.echo(f"{picture}")
 
     def _dataset(self) -> Dataset:
         return open_dataset(self.source, **self.texts.opening)

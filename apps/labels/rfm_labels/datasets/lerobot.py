@@ -6,6 +6,7 @@ Frame t belongs to row t; in a video, it is the frame at the row's time.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -15,26 +16,24 @@ from typing import Any
 
 from rfm_client import UInt8Array
 from rfm_client.frames import Picture, Video
-from rfm_client.options import InvalidValueError, checked_finite
 from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, listed, require
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S, Frames, Part, VideoRows
-from rfm_labels.datasets.lerobot_meta import (
-    EPISODES_FILE,
-    EPISODES_FOLDER,
-    Entry,
-    Info,
-    column_types,
-    read_entries,
-    read_table,
-)
+from rfm_labels.datasets.lerobot_meta import Entry, Info, column_types, read_entries, read_table
 from rfm_labels.datasets.lerobot_rows import TASK_COLUMN, RowReader, Sentences, has_numbers, read_sentences, table_of
-from rfm_labels.datasets.stored_files import Span, Times, digest_of, faults_at, file_identity, turn_mark
+from rfm_labels.datasets.stored_files import (
+    Span,
+    Times,
+    check_pictures,
+    digest_of,
+    faults_at,
+    file_identity,
+    picture_frames,
+    turn_mark,
+)
 
 _VIDEOS_AT_A_TIME = 4  # packets of this many videos, or one per camera, stay in memory
 _CONTAINER = {".mp4": "mov"}  # FFmpeg's names by suffix. Otherwise FFmpeg would open the files that a playlist names
-_LISTED_IN = dict.fromkeys(("v2.0", "v2.1"), EPISODES_FILE) | {"v3.0": EPISODES_FOLDER}
-_BY_PLACE = "LeRobot finds a sentence by position, so it may read a different one"
 
 
 class LeRobotDataset(Dataset):
@@ -54,18 +53,15 @@ class LeRobotDataset(Dataset):
         corrections: AskedCorrections = AskedCorrections(),
         tolerance_s: float = TOLERANCE_S,
     ) -> None:
-        try:
-            self._tolerance_s = checked_finite("tolerance_s", tolerance_s, "a number above 0")
-        except InvalidValueError as error:
-            raise DatasetError.like(error) from None
-        require("tolerance_s", tolerance_s > 0, "a number above 0", tolerance_s)
+        require("tolerance_s", 0 < tolerance_s < math.inf, "a number above 0", tolerance_s)
+        self._tolerance_s = tolerance_s
         self.root = root
         self.source = source or root.resolve().name
         self.revision = revision
         self.info = info = Info.read(root)
         self.kind = f"LeRobot {info.version}"
         self.cameras = (*info.videos, *info.images)
-        self.depth_cameras, self.left_out, self.notes = info.depth, info.left_out, info.notes
+        self.depth_cameras, self.left_out = info.depth, info.left_out
         self.corrections = corrections.of_cameras(self.cameras)
         entries = list(read_entries(info))
         self._entries = dict(entries)
@@ -77,14 +73,6 @@ class LeRobotDataset(Dataset):
         numbers = Counter(number for number, _ in entries)
         twice = [number for number in self.numbers if numbers[number] > 1]
         require(root / "meta", not twice, "each episode once", f"{listed(twice)} several times")
-        lengths = [entry.length for entry in self._entries.values() if isinstance(entry, Entry)]
-        counts = {"episodes": (len(self.numbers), info.total_episodes)}
-        if len(lengths) == len(self._entries):
-            counts["frames"] = (sum(lengths), info.total_frames)
-        for name, (count, stated) in counts.items():
-            if count != stated:
-                note = f"{name}: {count}, as {_LISTED_IN[info.version]} lists them; info.json says {stated}"
-                self.notes = [*self.notes, note]
 
     def _sentences(self) -> Sentences:
         """How to interpret the task column. Raises DatasetError for an unknown column or a broken task table."""
@@ -95,10 +83,7 @@ class LeRobotDataset(Dataset):
         if file is not None and not has_numbers(file, types, column):
             return Sentences(column)
         table, name = table_of(self.info, column)
-        sentences, shown = read_sentences(table, name), table.relative_to(self.root)
-        if list(sentences) != list(range(len(sentences))) and table.suffix == ".parquet":
-            self.notes = [*self.notes, f"tasks: {shown} is not in the order of {name}_index: {_BY_PLACE}"]
-        return Sentences(column, str(shown.with_suffix("")), sentences)
+        return Sentences(column, str(table.relative_to(self.root).with_suffix("")), read_sentences(table, name))
 
     def _types_of_rows(self) -> tuple[Path | None, Mapping[str, str]]:
         """The first readable row table, and its column types."""
@@ -120,28 +105,23 @@ class LeRobotDataset(Dataset):
     def decoder(self, camera: str) -> str | None:
         return Video.decoder() if camera in self.info.videos else Picture.decoder()
 
-    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+    def identity(self, episode: DatasetEpisode, camera: str) -> str:
         if camera not in self.info.videos:
             return digest_of(image + turn_mark(image).encode() for image in self._images(episode, camera))
         video, from_s = self._entry(episode.index).video(camera)
         clock = self._clocks[episode.index]
-        return f"{file_identity(video, verify=verify, revision=self.revision)} {from_s}{clock}"
+        return f"{file_identity(video, self.revision)} {from_s}{clock}"
 
     def check(self, episode: DatasetEpisode, camera: str) -> None:
         if camera in self.info.videos:
             self._frames_of(episode, camera)
-            return
-        for t, image in enumerate(self._images(episode, camera)):
-            with faults_at(_where(episode, camera, t)):
-                Picture(image).check()
+        else:
+            check_pictures(self._images(episode, camera), self.place(episode, camera))
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         if camera in self.info.videos:
-            yield from self.span(episode, camera).frames()
-            return
-        for t, image in enumerate(self._images(episode, camera)):
-            with faults_at(_where(episode, camera, t)):
-                yield Picture(image).pixels()
+            return self.span(episode, camera).frames()
+        return picture_frames(self._images(episode, camera), self.place(episode, camera))
 
     def times_s(self, episode: DatasetEpisode) -> Times:
         """Return frame times from the episode's start, float64 [T]. Raises DatasetError."""
@@ -151,7 +131,7 @@ class LeRobotDataset(Dataset):
         """Return the episode's frames in the camera's video. Raises DatasetError if a row has no frame of its own."""
         rows, frames = self._frames_of(episode, camera)
         tolerance_s = 0.5 * rows.apart_s(frames)
-        return Span(rows.video, rows.video.packets.times_s[frames], tolerance_s, f"{episode.name}: {camera}")
+        return Span(rows.video, rows.video.packets.times_s[frames], tolerance_s, self.place(episode, camera))
 
     def _entry(self, number: int) -> Entry:
         entry = self._entries[number]
@@ -192,7 +172,7 @@ class LeRobotDataset(Dataset):
         file = self._rows.file_of(self._entry(episode.index))
         stored = read_table(file, [camera], filters=[("episode_index", "=", episode.index)])[camera].to_pylist()
         require(f"{file}: {camera}", len(stored) == episode.num_frames, f"{episode.num_frames} images", len(stored))
-        return [self._image_bytes(_where(episode, camera, t), image) for t, image in enumerate(stored)]
+        return [self._image_bytes(f"{self.place(episode, camera)}: frame {t}", image) for t, image in enumerate(stored)]
 
     def _image_bytes(self, where: str, image: Any) -> bytes:
         image = image if isinstance(image, dict) else {}
@@ -205,7 +185,3 @@ class LeRobotDataset(Dataset):
             return (self.root / path).read_bytes()
         except OSError as error:
             raise DatasetError.at(where, "an image file", f"{error.strerror} ({path})") from error
-
-
-def _where(episode: DatasetEpisode, camera: str, t: int) -> str:
-    return f"{episode.name}: {camera}: frame {t}"
