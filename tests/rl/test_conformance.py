@@ -19,6 +19,7 @@ from environments import MAX_FRAMES, assert_close, progress
 from reward_doors import (
     DOORS,
     ENDED_BY_SUCCESS,
+    SAME_STEP,
     TASKS,
     VECTORS,
     Door,
@@ -71,6 +72,11 @@ def options(**more: Any) -> RewardOptions:
 
 def opened(kind: type[Door], client: RewardClient, envs: Sequence[gym.Env[Any, Any]], asked: RewardOptions) -> Door:
     return kind(makers_of(envs), client, asked)
+
+
+def copying(kind: type[Door], envs: Sequence[gym.Env[Any, Any]]) -> Sequence[gym.Env[Any, Any]]:
+    """Return the environments, wrapped for a door that resets them in the step that ends an episode."""
+    return [CopiedObservation(env) for env in envs] if kind.resets == SAME_STEP else envs
 
 
 def changes(factor: float, values: Sequence[float] = PROGRESS) -> list[float]:
@@ -290,7 +296,7 @@ def test_each_question_has_the_frames_of_its_own_episode(
     """Also after a failed call, whose frame is part of the episode. A step after an episode's end is refused."""
     envs = [CodedEnv(number, lengths, reuse=reuse) for number, lengths in enumerate(LENGTHS)]
     envs = envs if kind.asks_once else envs[:1]
-    with Recorder(failing) as client, opened(kind, client, envs, options(frames_from=source)) as door:
+    with Recorder(failing) as client, opened(kind, client, copying(kind, envs), options(frames_from=source)) as door:
         for call in range(CALLS):
             with pytest.raises(ServerUnavailableError) if call == failing else nullcontext():
                 go_on(door, envs) if call else door.reset()
@@ -351,20 +357,22 @@ def test_a_vector_goes_on_after_a_reset_of_the_environment_that_lost_a_frame(rec
 
 @at_each_door
 def test_an_episode_that_ends_where_the_next_begins_is_paid(judge: Recorder, kind: type[Door]) -> None:
-    with opened(kind, judge, [ReturningEnv()], options()) as door:
+    with opened(kind, judge, copying(kind, [ReturningEnv()]), options()) as door:
         ended = [episode for episode in played(door, 8)[0] if episode.terminated]
     assert len(ended) >= 2
     for episode in ended:
         assert episode.rewards == pytest.approx([PROGRESS[1], PROGRESS[0]])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("since", [0, 1])
-def test_a_process_that_may_have_drawn_over_a_last_frame_is_refused(judge: Recorder, since: int) -> None:
+@pytest.mark.parametrize("kind", [pytest.param(InProcesses, marks=pytest.mark.slow), VECTORS["SAME_STEP"]])
+def test_an_environment_that_may_have_drawn_over_its_last_frame_is_refused(
+    judge: Recorder, kind: type[Door], since: int
+) -> None:
     """Until an episode's last frame differs from the next one's first."""
     expected = r"^final_obs\[0\]: expected the last frame .*, got the first frame .*rfm_rl\.CopiedObservation"
     refused = pytest.raises(InvalidSampleError, match=expected) if since == 0 else nullcontext()
-    with opened(InProcesses, judge, [ReturningEnv(since)], options()) as door, refused:
+    with opened(kind, judge, [ReturningEnv(since)], options()) as door, refused:
         assert len(played(door, 4)[0]) == 3
 
 
@@ -469,7 +477,6 @@ WARNED = (
     "reset: expected the end of the episode before it, got one after 2 steps, whose reward is lost; put the time limit "
     "inside the wrapper: RewardModelWrapper(TimeLimit(env, steps), ...), or gymnasium.make(..., max_episode_steps=steps)"
 )
-REFUSED = "reset: expected the end of an episode before it, where mode 'final' pays, got one after 2 steps, .*TimeLimit"
 
 
 def cut(door: Door) -> None:
@@ -483,37 +490,10 @@ def of_first(door: Door) -> str:
     return "envs[0]: " if door.asks_once else ""
 
 
-@at_each_door
-def test_final_refuses_the_second_early_reset_in_a_row(
-    recorder: Recorder, warnings: Callable[[], list[str]], kind: type[Door]
-) -> None:
-    """It says so in the log at the first, which might be deliberate. A caller who means it may go on."""
-    with opened(kind, recorder, [CodedEnv()], options(mode="final")) as door:
-        cut(door)
-        assert warnings() == []
-        cut(door)
-        assert warnings() == [of_first(door) + WARNED]
-        with pytest.raises(ValueError, match=rf"^(envs\[0\]: )?{REFUSED}"):
-            cut(door)
-        cut(door)
-    assert warnings() == [of_first(door) + WARNED]
-
-
-@at_each_door
-def test_an_end_between_early_resets_allows_them(
-    recorder: Recorder, warnings: Callable[[], list[str]], kind: type[Door]
-) -> None:
-    """Evaluations reset early; of a vector, one environment may end in time."""
-    envs = [CodedEnv(0, (3,)), CodedEnv(1, (2,))] if kind.asks_once else [CodedEnv(0, (3, 2))]
-    with opened(kind, recorder, envs, options(mode="final")) as door:
-        for _ in range(4):
-            cut(door)
-    assert warnings() == [of_first(door) + WARNED]
-
-
 CUT: dict[str, tuple[dict[str, Any], bool]] = {  # options, and whether the last step's reward is lost
     "each step is paid": ({"mode": "delta"}, False),
     "every fourth step is scored": ({"mode": "delta", "every": 4}, True),
+    "final": ({"mode": "final"}, True),
     "final, which scores each step for the bonus": ({"mode": "final", "success_bonus": 1.0}, True),
 }
 
@@ -548,12 +528,6 @@ def test_resets_after_an_error_are_silent(
                 door.step()
             door.reset()
     assert warnings() == []
-    with opened(kind, recorder, [CodedEnv()], options(mode="final", success_bonus=1.0)) as door:
-        for _ in range(3):
-            door.reset()
-            recorder.server.failing = len(recorder.calls)
-            with pytest.raises(ServerUnavailableError):
-                door.step()
 
 
 REFUSED_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
@@ -568,10 +542,6 @@ REFUSED_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
     "two rules": (
         {"success": SuccessRule(0.9), "success_bonus": 1.0, "terminate_on_success": SuccessRule(0.8)},
         "^success: expected None or the rule of terminate_on_success, ",
-    ),
-    "an end that is not awaited": (
-        {"mode": "final", "blocking": False, "await_last": False},
-        "^await_last: expected True with mode 'final'",
     ),
     "fuse": ({"fuse": "sum"}, "^fuse: expected one of mean, min, max, got 'sum'$"),
     "orient": ({"orient": "upside-down"}, "^orient: expected one of none, rotate180, .*, got 'upside-down'$"),

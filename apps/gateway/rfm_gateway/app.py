@@ -31,7 +31,7 @@ from rfm_gateway import schema
 from rfm_gateway.access import ForeignPageMiddleware, key_check
 from rfm_gateway.body import Batch, BodyLimits, read_json, read_multipart
 from rfm_gateway.config import MIB, GatewayConfig
-from rfm_gateway.mounting import PageHost, add_docs, page_of
+from rfm_gateway.mounting import PageHost, page_of
 from rfm_gateway.observe import (
     CALLER_LEFT,
     REQUEST_ID_HEADER,
@@ -42,7 +42,7 @@ from rfm_gateway.observe import (
     RequestMiddleware,
     while_connected,
 )
-from rfm_gateway.refusals import LingerMiddleware, asked, refuse
+from rfm_gateway.refusals import asked, refuse
 from rfm_gateway.scoring import WARNING_HEADER, Evaluator
 from rfm_gateway.state import ServedParts, TritonState, message_of
 
@@ -60,21 +60,15 @@ logger = logging.getLogger("rfm_gateway")
 
 
 def create_app(
-    config: GatewayConfig,
-    api_key: str | None = None,
-    started_by: str = "rfm-client gateway",
-    *,
-    client: AsyncRewardClient | None = None,
+    config: GatewayConfig, api_key: str | None = None, *, client: AsyncRewardClient | None = None
 ) -> FastAPI:
     """Return the application.
 
     api_key: key that requests must show, except for health and documentation; None: no key
-    started_by: the command that a person repeats to restart this gateway
     client: for Triton; None: as ``config`` says
 
-    Raises OSError for a missing folder, ValueError for a malformed URL or an unusable file.
+    Raises ValueError for a malformed URL or an unusable file.
     """
-    folder = config.resolved_folder
     client, metrics = client or config.client(), GatewayMetrics()
     limits = BodyLimits(config.max_body_mib * MIB, config.timeout_s)
     parts = ServedParts()
@@ -86,14 +80,7 @@ def create_app(
             yield
 
     title, summary = "RFM evaluation gateway", "Rewards for robot trajectories."
-    app = FastAPI(
-        title=title,
-        summary=summary,
-        lifespan=lifespan,
-        docs_url=None,
-        redoc_url=None,
-        exception_handlers=_handlers(),
-    )
+    app = FastAPI(title=title, summary=summary, lifespan=lifespan, redoc_url=None, exception_handlers=_handlers())
     app.add_middleware(ForeignPageMiddleware, config=config, has_key=api_key is not None)  # innermost
     app.add_middleware(RequestMiddleware, metrics=metrics)
     if config.cors_origin:
@@ -104,11 +91,10 @@ def create_app(
             allow_headers=["*"],
             expose_headers=[REQUEST_ID_HEADER, WARNING_HEADER],
         )
-    app.add_middleware(LingerMiddleware)  # outermost: responses are counted before it lingers
     guards = [] if api_key is None else [Depends(key_check(api_key))]
     guarded = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
     evaluator = Evaluator(
-        client, limits, parts, folder, use_frame_steps=config.use_frame_steps, refuse_blank=config.refuse_blank
+        client, limits.timeout_s, parts, use_frame_steps=config.use_frame_steps, refuse_blank=config.refuse_blank
     )
     place = Depends(Places(config, metrics).taken)
     _add_evaluations(guarded, limits, evaluator, metrics, place)
@@ -120,10 +106,9 @@ def create_app(
         """Healthy if every model answers a probe or is busy."""
         return await state.health()
 
-    add_docs(app)
     add_page = page_of(config)
     if add_page is not None:
-        add_page(PageHost(app, guards, place, config, limits, metrics, started_by))
+        add_page(PageHost(app, guards, place, config, limits, metrics))
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]  # FastAPI's way to extend it
     return app
 

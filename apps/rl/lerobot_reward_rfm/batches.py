@@ -42,7 +42,8 @@ def trajectory_of(
             f"sample {index} of the batch: {error}. Give images as the dataset or the camera has them, "
             "before any normalization"
         ) from error
-    return replace(trajectory, frames=config.correction.applied(trajectory.positions))
+    (correction,) = config.scoring.corrections
+    return replace(trajectory, frames=correction.applied(trajectory.positions))
 
 
 def images_of(batch: Mapping[str, Any], key: str) -> Any:

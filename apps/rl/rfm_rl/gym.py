@@ -9,7 +9,7 @@ A wrapper keeps all frames of the running episode, H * W * 3 bytes per step. The
 A wrapper scores the reset, every ``every``-th step (not in mode ``final`` without a success rule), and the last step of
 an episode. With ``blocking``, a step waits for its score. Without ``blocking``, a step uses the newest known score, and
 requests its own only if fewer than ``max_pending`` steps have open requests. The reset always waits for its score. The
-last step waits, too, and cancels older requests; without ``blocking``, ``await_last=False`` leaves it unscored.
+last step waits, too, and cancels older requests.
 
 ``info["reward_model"]`` has the same keys after a reset and after a step: the returned ``reward`` and the environment's
 own ``env_reward`` (NaN at a reset), ``progress`` and ``success`` from the newest known score (success is NaN if the
@@ -27,8 +27,7 @@ model's summed rewards. These wrappers do not see an end by ``terminate_on_succe
 sum there.
 
 A time limit belongs inside the wrapper, as ``gymnasium.make`` puts it. If a reset drops the reward of an unended
-episode, a warning is logged once. In mode ``final``, a second such reset in a row, with no episode end and no error in
-between, raises ValueError.
+episode, a warning is logged once.
 """
 
 from __future__ import annotations
@@ -88,7 +87,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         self._has_statistics = env.has_wrapper_attr(RETURNS)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Reset the environment and score its first frame. Cancel open requests. Raises RewardError, ValueError."""
+        """Reset the environment and score its first frame. Cancel open requests. Raises RewardError."""
         self._envs.check_reset(_ALL)
         observation, info = self.env.reset(seed=seed, options=options)
         self._envs.tasks[0] = self._task if isinstance(self._task, str) else self._task(info)
