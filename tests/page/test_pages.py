@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from gateways import TestClient, inside
+from gateways import GatewayConfig, TestClient, create_app, inside
 from paths import ROOT
 from rfm_gateway import mounting
 
@@ -21,6 +21,7 @@ FILES = {
     "": "text/html",
     "viewer/main.js": "javascript",
     "viewer/examples/success.mp4": "video/mp4",
+    "docs/swagger-ui/swagger-ui.css": "text/css",
 }
 NO_FILES = ("viewer/missing.js", "viewer/routes.py", "viewer/..%2fapp.py", "viewer/%2fetc%2fpasswd", "viewer/a%00.css")
 
@@ -65,6 +66,13 @@ def test_without_a_page_the_gateway_serves_its_endpoints_alone(
         assert gateway.post("/evaluate_batch", json=[]).status_code == 422
         for path in ("/metrics", "/docs", "/openapi.json"):
             assert gateway.get(path).status_code == 200
+
+
+def test_the_command_that_adds_a_dataset_has_the_options_of_the_one_that_started_the_gateway() -> None:
+    app = create_app(GatewayConfig(triton="grpc://127.0.0.1:1", port=8100), started_by="rfm-client gateway")
+    with TestClient(app, "http://127.0.0.1") as gateway:
+        told = gateway.get("/viewer/server").json()["remedies"]["dataset"]
+    assert told == "rfm-client gateway --triton grpc://127.0.0.1:1 --port 8100 --dataset my_dataset"
 
 
 WITHOUT_LABELS = """

@@ -44,7 +44,7 @@ def test_a_page_goes_on_without_a_reload_when_triton_a_key_and_a_broken_dataset_
     with running(NOWHERE, tmp_path, port=port) as gateway:
         browser.driver.get(gateway.url)
         told = wait_for_state(browser, "served-state")
-        assert told.startswith("Triton is not ready\nrfm serve restarts it automatically")
+        assert told.startswith("Triton is not ready\nIt restarts automatically.")
         assert "rfm-client status --url grpc://127.0.0.1:1\nCopy" in told
         assert "Connection refused" not in told  # it stands behind Details
         browser.all("#served-state summary")[0].click()

@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import os
 import re
 import shutil
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import av
+import h5py
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -25,6 +27,7 @@ from gateways import inside
 from labelling import LEROBOT, BrightnessScorer
 from paths import ROOT
 from rfm_client.frames import read_video
+from rfm_client.options import ConfigError
 from rfm_labels import LabelOptions, label, open_dataset, read_episode_labels
 from rfm_labels.datasets import LeRobotDataset
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew, hdf5
@@ -219,7 +222,67 @@ def test_unknown_datasets_episodes_and_files_are_not_found(get: Get, path: str, 
     assert failure(get(path), 404) == message
 
 
-OF_VIDEO_0 = "/0/episodes/0/videos/0"
+def test_a_dataset_with_a_link_that_leaves_it_is_refused_at_start(folders: list[Path], tmp_path: Path) -> None:
+    root = copied("toy_v30_many", tmp_path)
+    (root / "videos").rename(tmp_path / "moved")
+    (root / "videos").symlink_to(folders[V30] / "videos")
+    expected = f"{root / 'videos'}: expected a file in the dataset's folder, got a link that leaves it"
+    with pytest.raises(ConfigError, match=expected), inside(dataset=(str(root),)):
+        pass
+
+
+def linked(file: Path, outside: Path) -> None:
+    file.unlink()
+    file.symlink_to(outside)
+
+
+def piped(file: Path, _outside: Path) -> None:
+    file.unlink()
+    os.mkfifo(file)  # opening it would block until a writer comes
+
+
+def external_link(file: Path, outside: Path) -> None:
+    with h5py.File(file, "r+") as opened:
+        opened[WRIST] = h5py.ExternalLink(str(outside), "/data")
+
+
+def virtual(file: Path, outside: Path) -> None:
+    layout = h5py.VirtualLayout((12, 16, 16, 3), np.uint8)
+    layout[:] = h5py.VirtualSource(str(outside), "data", layout.shape)
+    with h5py.File(file, "r+") as opened:
+        opened.create_virtual_dataset(WRIST, layout)
+
+
+def raw(file: Path, outside: Path) -> None:
+    with h5py.File(file, "r+") as opened:
+        opened.create_dataset(WRIST, (16,), np.uint8, external=[(str(outside), 0, 16)])
+
+
+WRIST = "data/demo_3/obs/wrist"
+ELSEWHERE = f"{WRIST}: expected data in the file, got data in another file"
+OF_VIDEO_0, OF_DEMO = "/0/episodes/0/videos/0", "/0/episodes/3/videos/0"
+CHANGES: dict[str, tuple[str, Callable[[Path, Path], None], str, str]] = {  # a file, its change, the path, the message
+    "a link": (VIDEO, linked, OF_VIDEO_0, "expected a file in the dataset's folder, got a link that leaves it"),
+    "a pipe": (VIDEO, piped, OF_VIDEO_0, f"{VIDEO}: expected a file or a folder, got a pipe, a socket or a device"),
+    "HDF5, a link": ("", external_link, OF_DEMO, ELSEWHERE),
+    "HDF5, a view": ("", virtual, OF_DEMO, ELSEWHERE),
+    "HDF5, another file's bytes": ("", raw, OF_DEMO, ELSEWHERE),
+    "HDF5, a pipe": ("", piped, OF_DEMO, "an HDF5 file, got a folder, a pipe, a socket or a device"),
+}
+
+
+@pytest.mark.parametrize(("name", "change", "path", "message"), CHANGES.values(), ids=CHANGES)
+def test_a_dataset_that_changes_to_show_another_file_is_not_read(
+    tmp_path: Path, name: str, change: Callable[[Path, Path], None], path: str, message: str
+) -> None:
+    root = copied("toy_v30_many", tmp_path) if name else hdf5(tmp_path)
+    outside = Path(shutil.copy(root / name, tmp_path / "outside"))
+    with serving(root) as get:
+        assert get(path).status_code == 200
+        change(root / name, outside)
+        assert message in failure(get(path), 500)
+
+
 BROKEN: dict[str, tuple[str, bytes | None, str, str]] = {  # a file, the content, the requested path, the message
     "no video": (VIDEO, None, OF_VIDEO_0, "file-000.mp4: expected a video file, got none"),
     "a play list": (VIDEO, b"#EXTM3U\n/etc/passwd\n", OF_VIDEO_0, "expected a whole video file, got Invalid data"),

@@ -31,7 +31,7 @@ from rfm_gateway import schema
 from rfm_gateway.access import ForeignPageMiddleware, key_check
 from rfm_gateway.body import Batch, BodyLimits, read_json, read_multipart
 from rfm_gateway.config import MIB, GatewayConfig
-from rfm_gateway.mounting import PageHost, page_of
+from rfm_gateway.mounting import PageHost, add_docs, page_of
 from rfm_gateway.observe import (
     CALLER_LEFT,
     REQUEST_ID_HEADER,
@@ -60,11 +60,16 @@ logger = logging.getLogger("rfm_gateway")
 
 
 def create_app(
-    config: GatewayConfig, api_key: str | None = None, *, client: AsyncRewardClient | None = None
+    config: GatewayConfig,
+    api_key: str | None = None,
+    started_by: str = "rfm-client gateway",
+    *,
+    client: AsyncRewardClient | None = None,
 ) -> FastAPI:
     """Return the application.
 
     api_key: key that requests must show, except for health and documentation; None: no key
+    started_by: the command that a person repeats to restart this gateway
     client: for Triton; None: as ``config`` says
 
     Raises ValueError for a malformed URL or an unusable file.
@@ -80,7 +85,14 @@ def create_app(
             yield
 
     title, summary = "RFM evaluation gateway", "Rewards for robot trajectories."
-    app = FastAPI(title=title, summary=summary, lifespan=lifespan, redoc_url=None, exception_handlers=_handlers())
+    app = FastAPI(
+        title=title,
+        summary=summary,
+        lifespan=lifespan,
+        docs_url=None,
+        redoc_url=None,
+        exception_handlers=_handlers(),
+    )
     app.add_middleware(ForeignPageMiddleware, config=config, has_key=api_key is not None)  # innermost
     app.add_middleware(RequestMiddleware, metrics=metrics)
     if config.cors_origin:
@@ -106,9 +118,10 @@ def create_app(
         """Healthy if every model answers a probe or is busy."""
         return await state.health()
 
+    add_docs(app)
     add_page = page_of(config)
     if add_page is not None:
-        add_page(PageHost(app, guards, place, config, limits, metrics))
+        add_page(PageHost(app, guards, place, config, limits, metrics, started_by))
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]  # FastAPI's way to extend it
     return app
 

@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -54,7 +55,7 @@ def gateway(config: GatewayOptions) -> None:
     address = config.address
     try:
         api_key, options = config.api_key(os.environ), server_options(config)
-        app = create_app(config, api_key)
+        app = create_app(config, api_key, _started_by(sys.argv[0]))
         address.check_free("gateway", port_option="--port")
     except ConfigError:  # with_options names the option
         raise
@@ -110,6 +111,12 @@ def gateway_command(config: GatewayConfig) -> list[str]:
         values = value if isinstance(value, tuple) else () if value is None else (value,)
         words += [word for value in values for word in (each.option, str(value))]
     return [sys.executable, "-m", "rfm_gateway", *words]
+
+
+def _started_by(program: str) -> str:
+    """Return the command that a person typed: this one, or ``rfm serve``, which runs ``python -m rfm_gateway``."""
+    name = Path(program).name
+    return f"{name} gateway" if name in ("rfm", "rfm-client") else "rfm serve"
 
 
 def page_link(config: GatewayConfig) -> str:

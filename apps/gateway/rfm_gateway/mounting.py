@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The page in the browser, which another package brings: its entry point in the group ``rfm_gateway.page`` names an
-``AddPage``.
+"""Browser pages: Swagger UI, and the page that another package brings.
+
+The page files are installed, so they need no network. The other package's entry point in the group
+``rfm_gateway.page`` names an ``AddPage``.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from rfm_gateway.observe import GatewayMetrics, while_connected
 __all__ = ["BodyLimits", "GatewayConfig", "PageHost", "field_errors", "invalid", "while_connected"]
 
 INSTALL = "pip install ./client ./apps/gateway ./apps/page"
+_PACKAGE = Path(__file__).parent
 _POLICY = (  # nothing from other hosts, no inline scripts or styles
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; media-src 'self' blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -45,12 +48,36 @@ class _Files(StaticFiles):
         return response
 
 
+def add_docs(app: FastAPI) -> None:
+    """Add Swagger UI and its files at ``/docs``."""
+    _add_files(app, "/docs", "/docs", _PACKAGE / "docs", **{"swagger-ui": _PACKAGE / "vendored" / "swagger-ui"})
+
+
+def _add_files(app: FastAPI, page: str, path: str, folder: Path, **folders: Path) -> None:
+    """Add a page whose ``index.html`` is in ``folder``.
+
+    page: path where the page is served
+    path: path where its files are served
+    folders: more of its files, by the name below ``path``
+    """
+    files = _Files(directory=folder)
+
+    @app.api_route(page, methods=["GET", "HEAD"], include_in_schema=False)
+    async def index(request: Request) -> Response:
+        return await files.get_response("index.html", request.scope)
+
+    for name, each in folders.items():
+        app.mount(f"{path}/{name}", _Files(directory=each))
+    app.mount(path, files)
+
+
 @dataclass(frozen=True)
 class PageHost:
     """The gateway that serves a page.
 
     guards: refuse requests without the gateway's key
     place: for endpoints that score: waits until another evaluation may run
+    started_by: the command that a person repeats to restart the gateway: ``rfm serve`` or a gateway command
     """
 
     app: FastAPI
@@ -59,6 +86,7 @@ class PageHost:
     config: GatewayConfig
     limits: BodyLimits
     metrics: GatewayMetrics
+    started_by: str
 
     def add_endpoints(self, router: APIRouter) -> None:
         """Serve endpoints to callers with the gateway's key."""
@@ -69,15 +97,7 @@ class PageHost:
 
         folders: more files, by the name below ``/viewer``
         """
-        files = _Files(directory=folder)
-
-        @self.app.api_route("/", methods=["GET", "HEAD"], include_in_schema=False)
-        async def index(request: Request) -> Response:
-            return await files.get_response("index.html", request.scope)
-
-        for name, each in folders.items():
-            self.app.mount(f"/viewer/{name}", _Files(directory=each))
-        self.app.mount("/viewer", files)
+        _add_files(self.app, "/", "/viewer", folder, **folders)
 
 
 AddPage: TypeAlias = Callable[[PageHost], None]  # adds a page; raises ConfigError for settings that it cannot serve

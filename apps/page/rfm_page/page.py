@@ -61,6 +61,7 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
                 datasets.append(ShownHdf5(dataset))
             else:  # RLDS
                 datasets.append(ShownDataset(dataset))
+            datasets[-1].check()
     except (DatasetError, ImportError) as error:
         raise ConfigError(str(error), "dataset") from None
     return datasets
@@ -71,7 +72,7 @@ def dataset_routes(datasets: Sequence[ShownDataset], limits: BodyLimits) -> APIR
     router = APIRouter(include_in_schema=False)
 
     async def read(request: Request, number: int, reading: Callable[[ShownDataset], Read]) -> Read:
-        """Read from a dataset in a thread, and return the result.
+        """Check a dataset and read from it, in a thread, and return the result.
 
         Raises HTTPException 404 for a missing part, 500 for a broken dataset, 504 if reading takes too long.
         """

@@ -11,6 +11,7 @@ import asyncio
 import itertools
 import logging
 import math
+import shlex
 import time
 from collections.abc import AsyncIterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -55,6 +56,7 @@ _SCORES: dict[str, dict[str, Any]] = {  # what the page's axes need
     }
     for name, score in _INSTEAD.items()
 }
+_REPOSITORY, _CHECKPOINT, _DATASET = "my_models", "my_checkpoint", "my_dataset"  # placeholders for the user's paths
 
 logger = logging.getLogger("rfm_gateway")
 
@@ -80,7 +82,7 @@ def viewer_routes(host: PageHost) -> APIRouter:
         rules = [{"name": rule, "frames": _frames_of(rule)} for rule in get_args(Rule)]
         about: dict[str, Any] = {"rules": rules, "orientations": get_args(Orientation)}
         about |= {"channel_orders": get_args(ChannelOrder), "scores": _SCORES, "fps": DEFAULT_FPS}
-        return JSONResponse({**about, "url": config.triton_url})
+        return JSONResponse({**about, "url": config.triton_url, "remedies": _remedies(config, host.started_by)})
 
     @router.get("/viewer/served")
     async def served() -> Response:
@@ -238,3 +240,29 @@ async def _preferences(client: AsyncRewardClient, asked: _Asked) -> dict[str, An
 
 def _event(name: str, **document: Any) -> str:
     return f"event: {name}\ndata: {to_json(document, inf_nan_mode='null').decode()}\n\n"  # JSON has no NaN
+
+
+def _remedies(config: GatewayConfig, started_by: str) -> dict[str, str | bool]:
+    """Return a command line for each fault, with the options that the page was started with.
+
+    start: the server has ended
+    dataset: there is no dataset
+    triton: Triton does not answer
+    model: Triton serves no model
+    starts_triton: True: ``start`` also starts Triton
+    """
+    url = shlex.quote(config.triton_url)
+    port = str(config.address.port)
+    is_beside = started_by == "rfm serve"
+    start = (
+        f"{started_by} {_REPOSITORY} --gateway-port {port}"
+        if is_beside
+        else f"{started_by} --triton {url} --port {port}"
+    )
+    return {
+        "start": start,
+        "dataset": f"{start} {'--gateway-dataset' if is_beside else '--dataset'} {_DATASET}",
+        "triton": f"rfm-client status --url {url}" if is_beside else f"rfm serve {_REPOSITORY}",
+        "model": f"rfm export {_CHECKPOINT} --repository {_REPOSITORY}",
+        "starts_triton": is_beside,
+    }

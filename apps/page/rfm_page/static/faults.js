@@ -4,13 +4,11 @@
 import { ServerError } from "./api.js";
 
 const BY_ITSELF = "Checking automatically.";
-const START = "rfm serve my_models --gateway-port 8100";
-const WITH_DATASET = `${START} --gateway-dataset my_dataset`;
-let triton = ""; // its URL
+let remedies = {}; // command lines of this server, by what is missing
 
-/** From now on, states name the URL of this server's Triton. */
-export function useTriton(url) {
-  triton = url;
+/** From now on, states name the command lines of this server. */
+export function useRemedies(told) {
+  remedies = told;
 }
 
 /** The server that brought the page is away. */
@@ -18,7 +16,7 @@ export function serverAway(error, retry) {
   return {
     title: "The server does not answer",
     text: "It has stopped, or the network is down. If it does not come back, restart it with your options, for example:",
-    command: START,
+    command: remedies.start,
     details: error.message,
     buttons: [["Check now", retry]],
     note: BY_ITSELF,
@@ -27,10 +25,13 @@ export function serverAway(error, retry) {
 
 /** Triton is away behind the server. */
 export function tritonAway(error, retry) {
+  const text = remedies.starts_triton
+    ? "It restarts automatically. If this takes more than a minute, check it:"
+    : "The server reaches no Triton. Start one where the server looks for it, for example:";
   return {
     title: "Triton is not ready",
-    text: "rfm serve restarts it automatically; without rfm serve, start it. To check it:",
-    command: `rfm-client status --url ${triton}`,
+    text,
+    command: remedies.triton,
     details: error.message,
     buttons: [["Check now", retry]],
     note: BY_ITSELF,
@@ -42,7 +43,7 @@ export function noModel(retry) {
     kind: "empty",
     title: "No model is served",
     text: "Triton runs, but has no model that scores videos. Export a checkpoint into its repository:",
-    command: "rfm export my_checkpoint --repository my_models",
+    command: remedies.model,
     buttons: [["Check now", retry]],
     note: BY_ITSELF,
   };
@@ -53,7 +54,7 @@ export function noDataset(retry) {
     kind: "empty",
     title: "No dataset yet",
     text: "Restart the server with a LeRobot or RLDS folder or an HDF5 file, and look through its episodes here:",
-    command: WITH_DATASET,
+    command: remedies.dataset,
     buttons: [["Check now", retry]],
     note: BY_ITSELF,
   };
@@ -64,7 +65,7 @@ export function noEpisode(retry) {
     kind: "empty",
     title: "No episodes",
     text: "This dataset is empty. Record into it, or restart the server with another one:",
-    command: WITH_DATASET,
+    command: remedies.dataset,
     buttons: [["Check now", retry]],
   };
 }
@@ -79,7 +80,7 @@ export function noVideo(retry) {
     kind: "empty",
     title: "No videos",
     text: "This dataset has no camera; the curves are below. To see episodes, restart the server with a dataset that has cameras:",
-    command: WITH_DATASET,
+    command: remedies.dataset,
     buttons: [["Check now", retry]],
   };
 }

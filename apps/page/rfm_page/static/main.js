@@ -7,7 +7,7 @@ import { Asking } from "./asking.js";
 import { Curve } from "./curves.js";
 import { DatasetTab } from "./dataset.js";
 import { exampleFiles } from "./examples.js";
-import { failure, noModel, otherModel, serverAway, tritonAway, useTriton } from "./faults.js";
+import { failure, noModel, otherModel, serverAway, tritonAway, useRemedies } from "./faults.js";
 import { pngFigure, svgFigure } from "./figure.js";
 import { onKeys } from "./keys.js";
 import { Legend } from "./legend.js";
@@ -66,7 +66,7 @@ async function askServer(isCurrent) {
   learn(about.scores); // before a tab draws a curve
   if (!isCurrent()) return true;
   if (!gateway.rules.length) offer(about);
-  useTriton(about.url);
+  useRemedies(about.remedies);
   places.away.clear();
   page["key-form"].hidden = true;
   datasetTab.begin();
