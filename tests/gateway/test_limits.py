@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import json
 import subprocess
+import urllib.error
+import urllib.request
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -157,9 +159,19 @@ def locked(triton: StandIn) -> Iterator[Address]:
         yield started
 
 
+def by_urllib(url: str, headers: dict[str, str]) -> int:
+    """Asks with ``Connection: close``, and reads the answer after the whole body."""
+    with pytest.raises(urllib.error.HTTPError) as refusal:
+        urllib.request.urlopen(urllib.request.Request(url, LARGE, headers))
+    with refusal.value as answer:
+        return answer.code
+
+
+CLOSE = {"Connection": "close"}
 BY_PYTHON: dict[str, Callable[[str, dict[str, str]], int]] = {
-    "requests": lambda url, headers: requests.post(url, LARGE, headers=headers).status_code,
-    "httpx": lambda url, headers: httpx.post(url, content=LARGE, headers=headers).status_code,
+    "urllib": by_urllib,
+    "requests": lambda url, headers: requests.post(url, LARGE, headers=headers | CLOSE).status_code,
+    "httpx": lambda url, headers: httpx.post(url, content=LARGE, headers=headers | CLOSE).status_code,
 }
 REFUSED = {401: {}, 413: {"X-API-Key": KEY}}  # before the body is read
 
@@ -172,13 +184,26 @@ def test_a_caller_who_sends_all_before_it_reads_gets_the_refusal(
         assert post(f"{locked.url}/evaluate_batch", headers) == code
 
 
-def test_curl_gets_the_refusal(locked: Address, curl: str, tmp_path: Path) -> None:
+BY_NODE = """
+const [url, headers, file] = process.argv.slice(1);
+const options = { method: "POST", headers: JSON.parse(headers), agent: false };
+const request = require("http").request(url, options, ({ statusCode }) => {
+  process.stdout.write(`${statusCode}`);
+  request.destroy();
+});
+request.end(require("fs").readFileSync(file));
+"""
+
+
+def test_node_and_curl_get_the_refusal(locked: Address, curl: str, node: str, tmp_path: Path) -> None:
     (tmp_path / "body").write_bytes(LARGE)
-    command = [curl, "-sS", "-o", "/dev/null", "-w", "%{http_code}", "--data-binary", f"@{tmp_path / 'body'}"]
+    url, file = f"{locked.url}/evaluate_batch", str(tmp_path / "body")
+    by_curl = [curl, "-sS", "-o", "/dev/null", "-w", "%{http_code}", "--data-binary", f"@{file}", "-H", "Expect:", url]
     for code, headers in REFUSED.items():
         words = [word for name, value in headers.items() for word in ("-H", f"{name}: {value}")]
-        done = subprocess.run([*command, f"{locked.url}/evaluate_batch", *words], stdout=subprocess.PIPE, check=True)
-        assert done.stdout == b"%d" % code
+        by_node = [node, "-e", BY_NODE, url, json.dumps(headers | CLOSE), file]
+        for command in (by_node, [*by_curl, *words], [*by_curl, *words, "--http1.0"]):
+            assert subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout == b"%d" % code
 
 
 UPGRADES = {

@@ -23,6 +23,7 @@ PACKAGES = {  # by program
     "docker-compose": "docker-compose",
     "ffmpeg": "ffmpeg",
     "nginx": "nginx",
+    "node": "nodejs",
     "openssl": "openssl",
     "prometheus": "prometheus",
     "promtool": "prometheus",
@@ -54,7 +55,7 @@ def _fixture(program: str) -> str:
     return program.replace("-", "_")
 
 
-curl, docker_compose, ffmpeg, nginx, openssl, prometheus, promtool = (
+curl, docker_compose, ffmpeg, nginx, node, openssl, prometheus, promtool = (
     _program(name) for name in sorted(PACKAGES.keys() - set(BROWSER))
 )
 PROGRAMS = {"browser": BROWSER, **{_fixture(name): (name,) for name in PACKAGES if name not in BROWSER}}  # by fixture

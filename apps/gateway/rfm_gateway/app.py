@@ -42,7 +42,7 @@ from rfm_gateway.observe import (
     RequestMiddleware,
     while_connected,
 )
-from rfm_gateway.refusals import asked, refuse
+from rfm_gateway.refusals import LingerMiddleware, asked, refuse
 from rfm_gateway.scoring import WARNING_HEADER, Evaluator
 from rfm_gateway.state import ServedParts, TritonState, message_of
 
@@ -103,6 +103,7 @@ def create_app(
             allow_headers=["*"],
             expose_headers=[REQUEST_ID_HEADER, WARNING_HEADER],
         )
+    app.add_middleware(LingerMiddleware)  # outermost: responses are counted before it lingers
     guards = [] if api_key is None else [Depends(key_check(api_key))]
     guarded = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
     evaluator = Evaluator(

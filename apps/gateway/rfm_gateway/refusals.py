@@ -7,10 +7,12 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
+import anyio
 from starlette.datastructures import Headers
 from starlette.responses import JSONResponse
-from starlette.types import Scope
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+LINGER_S = 10.0  # as aiohttp
 _MOST_LETTERS = 500  # in a logged reason
 _MOST_NAME_LETTERS = 100  # in a logged path or program
 
@@ -24,6 +26,43 @@ def refuse(scope: Scope, code: int, detail: Any, headers: Mapping[str, str] | No
     """
     logger.warning("%d %s: %s", code, asked(scope), _reason(detail))
     return JSONResponse({"detail": detail}, code, headers)
+
+
+class LingerMiddleware:
+    """ASGI middleware that reads and drops the rest of a body after the response, for at most LINGER_S.
+
+    Closing a connection with unread bytes resets it. Callers that send all before they read, such as urllib, would get
+    the reset instead of the refusal.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve a request. The response, and with it the connection, ends once the body has ended."""
+        is_read = is_answered = False
+
+        async def receive_to_the_end() -> Message:
+            nonlocal is_read
+            message = await receive()
+            is_read = not message.get("more_body", False)
+            return message
+
+        async def send_without_end(message: Message) -> None:
+            nonlocal is_answered
+            is_last = message["type"] == "http.response.body" and not message.get("more_body", False)
+            is_answered = is_last and not is_read
+            await send({**message, "more_body": True} if is_answered else message)
+
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        await self._app(scope, receive_to_the_end, send_without_end)
+        if is_answered:
+            with anyio.move_on_after(LINGER_S):
+                while not is_read:
+                    await receive_to_the_end()
+            await send({"type": "http.response.body"})
 
 
 def asked(scope: Scope) -> str:
