@@ -32,6 +32,8 @@ from rfm_commands.config import Config
 HERE = Path(__file__).parent
 DEMO = HERE.parent / "model_repository"
 DEMO_ENCODERS = {f"{kind}_encoder": str(DEMO / "rfm_encoder" / "1" / f"{kind}_encoder") for kind in ("image", "text")}
+VLM = HERE.parent / "tests" / "golden" / "vlm"
+VLM_CHECKPOINT, VLM_BASE = VLM / "q3_tok_disc10" / "checkpoint", VLM / "bases" / "q3"
 PEERS = {"FastAPI": "fastapi_server.py", "mosec": "mosec_server.py"}
 START_S = 120
 CORES_OF_A_PROCESS = 4  # one for a Python caller process, the others for the server
@@ -55,7 +57,7 @@ class Checkpoint:
     """A checkpoint and its export.
 
     threads: torch threads in every server
-    widths: frame and text embedding width
+    widths: frame and text embedding width; 0: the checkpoint takes frames
     """
 
     folder: Path
@@ -67,13 +69,16 @@ class Checkpoint:
 def checkpoint(size: str, folder: Path) -> Checkpoint:
     """Export and return a checkpoint.
 
-    size: ``small``: the demo's checkpoint and settings; ``default``: upstream's default size, random weights
+    size: ``small``: the demo's checkpoint and settings; ``default``: upstream's default size, random weights;
+        ``vlm``: a tiny checkpoint on Qwen3-VL
     """
     repository, threads = folder / f"repository_{size}", torch.get_num_threads()
     settings = ExportConfig(num_gpus=0, torch_threads=threads)
     if size == "small":
         source, widths = DEMO / "rfm" / "1" / "checkpoint", (64, 32)
         settings = replace(Config.from_yaml(DEMO / "serve.yaml").export, **DEMO_ENCODERS)
+    elif size == "vlm":
+        source, widths, settings = VLM_CHECKPOINT, (0, 0), replace(settings, base_model=str(VLM_BASE))
     else:
         torch.manual_seed(0)
         source, widths = folder / size, (DEFAULT_SIZE.video_feature_dim, DEFAULT_SIZE.text_feature_dim)
@@ -118,7 +123,7 @@ class Contestant:
             assert process.stdin is not None
             process.stdin.write(json.dumps(asdict(share)) + "\n")
             process.stdin.flush()
-        measured = Measured.of([_calls(process) for process in callers])
+        measured = Measured.of([_calls(process) for process in callers], load.together)
         after_s = _cpu_s(self._processes), _cpu_s(asking)
         count = max(measured.samples_per_s * measured.took_s, 1)
         server_us, client_us = ((after - b) / count * US_PER_S for after, b in zip(after_s, before_s, strict=True))

@@ -46,6 +46,7 @@ PEERS = {
     "gateway": clients.fastapi_npy,
     "mosec": lambda session, url: clients.by_msgpack(session, f"{url}/inference"),
 }
+SHARED_MEMORY = "shared memory"  # a way
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,7 @@ class Load:
     frames: smallest and largest frame count per sample
     mixed: True: all three sample types in turn; False: only progress
     rate_per_s: calls per second in the open loop
+    together: samples per call
     frame_px: raw frame height and width; None: embeddings
     repeated: True: cycle through NUM_FILMED raw frame samples; False: each frame is new
     warm_up_s: time before calls count
@@ -67,6 +69,7 @@ class Load:
     frames: tuple[int, int]
     mixed: bool = False
     rate_per_s: float = 0.0
+    together: int = 1
     frame_px: tuple[int, int] | None = None
     repeated: bool = False
     warm_up_s: float = 0.0
@@ -104,7 +107,7 @@ class Measured:
 
     @classmethod
     def of(cls, calls: Sequence[Calls], together: int = 1) -> Measured:
-        """Combine the results from processes that called at the same time. together: samples per latency."""
+        """Combine the results from processes that called at the same time. together: samples per call."""
         latencies_s = [latency_s for each in calls for latency_s in each.latencies_s]
         rate = sum(len(each.latencies_s) * together / each.took_s for each in calls)
         p50, p99 = np.percentile(latencies_s, [50, 99]) * MS_PER_S if latencies_s else (float("nan"),) * 2
@@ -166,17 +169,18 @@ def _filmed(load: Load) -> Callable[[int, int, int], Trajectory]:
 
 @asynccontextmanager
 async def connected(way: str, url: str) -> AsyncIterator[Ask]:
-    """Yield a function that scores a sample."""
+    """Yield a function that scores samples in one call."""
     if way in PEERS:
         async with aiohttp.ClientSession(
             connector=aiohttp.TCPConnector(limit=0, keepalive_timeout=KEEP_ALIVE_S)
         ) as session:
             yield PEERS[way](session, url)
         return
-    async with AsyncRewardClient(url, max_in_flight=IN_FLIGHT, retry=False) as client:
+    memory = way == SHARED_MEMORY
+    async with AsyncRewardClient(url, shared_memory=memory, max_in_flight=IN_FLIGHT, retry=False) as client:
 
-        async def ask(sample: Sample) -> float:
-            return _score((await client.evaluate([sample]))[0])
+        async def ask(samples: Sequence[Sample]) -> list[float]:
+            return [_score(result) for result in await client.evaluate(samples)]
 
         yield ask
 
@@ -198,14 +202,14 @@ async def measure(ask: Ask, load: Load, sample: Callable[[int], Sample]) -> Call
     async def answered(index: int, due_s: float) -> None:
         nonlocal failed
         try:
-            await ask(sample(index))
+            await ask([sample(index * load.together + i) for i in range(load.together)])
             now_s = time.perf_counter()
             if now_s > started_s:
                 latencies_s.append(now_s - due_s)
         except Exception as error:  # noqa: BLE001  every error counts as failed samples
             if not failed:
                 print(f"first error: {error!r:.500}", file=sys.stderr)
-            failed += 1
+            failed += load.together
 
     async def call(index: int) -> None:
         while time.perf_counter() < end_s:
@@ -233,7 +237,7 @@ async def main(way: str, url: str, video_dim: int, text_dim: int) -> None:
             load = Load(**json.loads(line))
             sample = samples(load, video_dim, text_dim)
             for index in range(3):  # opens connections, and warms up each sample type
-                await ask(sample(index))
+                await ask([sample(index)])
             print(json.dumps(asdict(await measure(ask, load, sample))), flush=True)
 
 

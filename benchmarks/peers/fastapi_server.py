@@ -2,8 +2,8 @@
 """The design of the FastAPI evaluation server, with one replica on the CPU.
 
 As in its README: a pool of identical replicas, a thread pool for checkout and inference, and a free replica for each
-request alone. Samples of different requests never share a forward pass. All samples in a request have the same length.
-A bad sample fails its whole request. Only the faster endpoint, npy, is here, and only progress.
+request alone. Samples of different requests never share a forward pass. All samples of a type in a request have the
+same length. A bad sample fails its whole request. Only the faster endpoint, npy, is here.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from queue import Queue
 from typing import Any
@@ -20,13 +20,18 @@ import numpy as np
 import torch
 import uvicorn
 from fastapi import FastAPI, Request
-from options import options
 from starlette.datastructures import UploadFile
-from upstream_forward import UpstreamRewind, load
+from torch import Tensor
+from upstream_forward import Scores, UpstreamRewind, load, progress_of
 
-from rfm.engine.layers import progress_from_logits
+from engines import options
 
 UPLOAD_KEY = "__numpy_file__"
+TRAJECTORIES = {  # for each sample type, in the network's order
+    "progress": ("trajectory",),
+    "preference": ("chosen_trajectory", "rejected_trajectory"),
+    "similarity": ("ref_trajectory", "sim_trajectory"),
+}
 
 Json = Mapping[str, Any]
 
@@ -83,16 +88,34 @@ def _merged(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 
 @torch.inference_mode()
 def _score(network: UpstreamRewind, samples: Sequence[Json]) -> Json:
-    """Return the answer to a request, from one forward pass. Raises RuntimeError if trajectory lengths differ."""
-    text, video = (
-        torch.stack([torch.as_tensor(sample["trajectory"][name], dtype=torch.float32) for sample in samples])
-        for name in ("text_embedding", "video_embeddings")
-    )
-    progress, success = network(text, video)
-    return {
-        "outputs_progress": {"progress_pred": progress_from_logits(progress).tolist()},
-        "outputs_success": {"success_probs": success.sigmoid().tolist()},
-    }
+    """Return the answer to a request, with one forward pass per sample type."""
+    outputs = ("outputs_preference", "outputs_progress", "outputs_success", "outputs_similarity")
+    answer: dict[str, Any] = dict.fromkeys(outputs)
+    for kind in TRAJECTORIES:
+        of_kind = [sample for sample in samples if sample["sample_type"] == kind]
+        if not of_kind:
+            continue
+        scores = _forward(network, of_kind, kind)
+        if kind == "progress":
+            answer["outputs_progress"] = {"progress_pred": progress_of(scores.progress).tolist()}
+            answer["outputs_success"] = {"success_probs": scores.success.sigmoid().tolist()}
+        elif kind == "preference":
+            answer["outputs_preference"] = {"prediction_probs": scores.query.sigmoid().tolist()}
+        else:
+            answer["outputs_similarity"] = {"sim_score_ref_sim": scores.query.tolist()}
+    return answer
+
+
+def _forward(network: UpstreamRewind, samples: Sequence[Json], kind: Any) -> Scores:
+    """Return raw scores for samples with one type. Raises RuntimeError if trajectory lengths differ."""
+    sides = [[sample[name] for sample in samples] for name in TRAJECTORIES[kind]]
+    text = _stacked(trajectory["text_embedding"] for trajectory in sides[0])
+    videos = [_stacked(trajectory["video_embeddings"] for trajectory in side) for side in sides]
+    return network(text, *videos, sample_type=kind)
+
+
+def _stacked(arrays: Iterable[Any]) -> Tensor:
+    return torch.stack([torch.as_tensor(array, dtype=torch.float32) for array in arrays])
 
 
 def main() -> None:

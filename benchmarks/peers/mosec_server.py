@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Our engine behind mosec, with its dynamic batching: a Rust HTTP process and an inference process.
 
-A request is a msgpack map for one progress sample, with arrays as float32 bytes: ``shape``, [T, D], ``video`` and
-``text``. Its answer has ``progress``, float32 [T], or ``error``. In mosec, an unreadable request fails its whole batch.
+Requests and answers are msgpack (``engines``). The answer to an invalid sample has ``error``. In mosec, an unreadable
+request fails its whole batch.
 """
 
 from __future__ import annotations
@@ -14,14 +14,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mosec
-import numpy as np
 import torch
 from mosec.mixin import MsgpackMixin
-from options import options
 
-from rfm import published
-from rfm.engine import Engine
-from rfm_client import ProgressResult, ProgressSample, Trajectory
+from engines import answer_of, engine_of, options, sample_of
 
 MAX_BATCH_SIZE = 64
 MAX_WAIT_MS = 1  # mosec's minimum
@@ -36,20 +32,11 @@ class RewardWorker(MsgpackMixin, mosec.Worker):
         warnings.filterwarnings("ignore", "IPC data", RuntimeWarning)  # one warning for each large batch
         torch.set_num_threads(int(os.environ["PEER_THREADS"]))
         torch.set_num_interop_threads(1)
-        self.engine = Engine.of(published.load(os.environ["PEER_CHECKPOINT"]))
+        self.engine = engine_of(os.environ["PEER_CHECKPOINT"])
 
     def forward(self, data: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """Return the answer to each request in a batch."""
-        samples = []
-        for message in data:
-            video = np.frombuffer(message["video"], np.float32).reshape(message["shape"])
-            text = np.frombuffer(message["text"], np.float32)
-            samples.append(ProgressSample(Trajectory(video_embeddings=video, text_embedding=text)))
-        outcomes = self.engine.evaluate(samples)
-        return [
-            {"progress": outcome.progress.tobytes()} if isinstance(outcome, ProgressResult) else {"error": str(outcome)}
-            for outcome in outcomes
-        ]
+        return [answer_of(outcome) for outcome in self.engine.evaluate([sample_of(message) for message in data])]
 
 
 def main() -> None:
