@@ -371,24 +371,45 @@ def reversed_rows(file: Path) -> None:
     parquet.write_table(table.take(list(reversed(range(len(table))))), file)
 
 
-ODDITIES: dict[str, Break] = {
-    "info.json counts more": told(total_episodes=11, total_frames=430),
-    "rows in another file": rows_in_a_later_file,
-    "sentences out of order": lambda root: reversed_rows(root / "meta" / "tasks.parquet"),
-    "no place of a camera that is not asked for": cells(
-        V30_EPISODES, f"videos/{WRIST}/from_timestamp", lambda values: [None] * len(values)
+WITH_NOTES: dict[str, tuple[Break, list[str]]] = {
+    "info.json counts more": (
+        told(total_episodes=11, total_frames=430),
+        [
+            f"{name}, as meta/episodes lists them; info.json says {told}"
+            for name, told in (("episodes: 10", 11), ("frames: 428", 430))
+        ],
+    ),
+    "no version": (
+        lambda root: change_info(root, lambda info: info.pop("codebase_version")),
+        ["version: v3.0, by the files of meta, since info.json has no codebase_version"],
+    ),
+    "rows in another file": (
+        rows_in_a_later_file,
+        [],
+    ),
+    "sentences out of order": (
+        lambda root: reversed_rows(root / "meta" / "tasks.parquet"),
+        [
+            "tasks: meta/tasks.parquet is not in the order of task_index: LeRobot finds a sentence by position, so it may "
+            "read a different one"
+        ],
+    ),
+    "no place of a camera that is not asked for": (
+        cells(V30_EPISODES, f"videos/{WRIST}/from_timestamp", lambda values: [None] * len(values)),
+        [],
     ),
 }
 
 
-@pytest.mark.parametrize("change", ODDITIES.values(), ids=ODDITIES)
-def test_oddities_that_lerobot_reads_are_read(tmp_path: Path, change: Break) -> None:
+@pytest.mark.parametrize(("change", "notes"), WITH_NOTES.values(), ids=WITH_NOTES)
+def test_oddities_that_lerobot_reads_are_read_with_a_note(tmp_path: Path, change: Break, notes: list[str]) -> None:
     root = shutil.copytree(LEROBOT / "toy_v30_many", tmp_path / "toy")
     change(root)
     dataset, whole = open_dataset(root), open_dataset(LEROBOT / "toy_v30_many")
     assert dataset.episodes == whole.episodes
     for number in (4, 5):
         dataset.check(dataset.episode(number), FRONT)
+    assert list(dataset.notes) == notes
 
 
 OPENED = f"""

@@ -34,7 +34,7 @@ from rfm_client.frames import BlankFrames
 from rfm_client.options import first_names
 from rfm_client.serving import off_loop
 from rfm_gateway import schema
-from rfm_gateway.body import Batch, BodyLimits
+from rfm_gateway.body import Batch
 from rfm_gateway.field_errors import refused
 from rfm_gateway.observe import within
 from rfm_gateway.state import ServedParts

@@ -66,7 +66,6 @@ class ProgressBar(Watch):
             disable=not console.is_terminal,
             speed_estimate_period=SPEED_OVER_S,
         )
-        self._shown = self._bar.add_task("", visible=False)
         self.num_begun = 0
 
     def __enter__(self) -> ProgressBar:
@@ -86,7 +85,7 @@ class ProgressBar(Watch):
 
     def checked(self, episode: DatasetEpisode) -> None:
         """Advance the bar by an episode."""
-        self._bar.advance(self._shown)
+        self._advance(1)
 
     def begin(self, num_frames: int, num_finished: int) -> None:
         """Start counting labelled frames."""
@@ -97,16 +96,22 @@ class ProgressBar(Watch):
 
     def scored(self, episode: DatasetEpisode) -> None:
         """Advance the bar by the episode's frames."""
-        self._bar.advance(self._shown, episode.num_frames)
+        self._advance(episode.num_frames)
 
     def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
         """Write a line with the reason."""
         text = str(error)
         self._say(text if text.startswith(episode.name) else f"{episode.name}: {text}")
-        self.scored(episode)
+        self._advance(episode.num_frames)
 
     def _begin(self, text: str, total: int, completed: int) -> None:
-        self._bar.reset(self._shown, description=text, total=total, completed=completed, visible=True)
+        for task in self._bar.task_ids:
+            self._bar.remove_task(task)
+        self._bar.add_task(text, total=total, completed=completed)
+
+    def _advance(self, by: int) -> None:
+        for task in self._bar.task_ids:
+            self._bar.advance(task, by)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,15 @@ from rfm_client.frames import Picture, Video
 from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, listed, require
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S, Frames, Part, VideoRows
-from rfm_labels.datasets.lerobot_meta import Entry, Info, column_types, read_entries, read_table
+from rfm_labels.datasets.lerobot_meta import (
+    EPISODES_FILE,
+    EPISODES_FOLDER,
+    Entry,
+    Info,
+    column_types,
+    read_entries,
+    read_table,
+)
 from rfm_labels.datasets.lerobot_rows import TASK_COLUMN, RowReader, Sentences, has_numbers, read_sentences, table_of
 from rfm_labels.datasets.stored_files import (
     Span,
@@ -34,6 +42,8 @@ from rfm_labels.datasets.stored_files import (
 
 _VIDEOS_AT_A_TIME = 4  # packets of this many videos, or one per camera, stay in memory
 _CONTAINER = {".mp4": "mov"}  # FFmpeg's names by suffix. Otherwise FFmpeg would open the files that a playlist names
+_LISTED_IN = dict.fromkeys(("v2.0", "v2.1"), EPISODES_FILE) | {"v3.0": EPISODES_FOLDER}
+_BY_PLACE = "LeRobot finds a sentence by position, so it may read a different one"
 
 
 class LeRobotDataset(Dataset):
@@ -61,7 +71,7 @@ class LeRobotDataset(Dataset):
         self.info = info = Info.read(root)
         self.kind = f"LeRobot {info.version}"
         self.cameras = (*info.videos, *info.images)
-        self.depth_cameras, self.left_out = info.depth, info.left_out
+        self.depth_cameras, self.left_out, self.notes = info.depth, info.left_out, info.notes
         self.corrections = corrections.of_cameras(self.cameras)
         entries = list(read_entries(info))
         self._entries = dict(entries)
@@ -73,6 +83,14 @@ class LeRobotDataset(Dataset):
         numbers = Counter(number for number, _ in entries)
         twice = [number for number in self.numbers if numbers[number] > 1]
         require(root / "meta", not twice, "each episode once", f"{listed(twice)} several times")
+        lengths = [entry.length for entry in self._entries.values() if isinstance(entry, Entry)]
+        counts = {"episodes": (len(self.numbers), info.total_episodes)}
+        if len(lengths) == len(self._entries):
+            counts["frames"] = (sum(lengths), info.total_frames)
+        for name, (count, stated) in counts.items():
+            if count != stated:
+                note = f"{name}: {count}, as {_LISTED_IN[info.version]} lists them; info.json says {stated}"
+                self.notes = [*self.notes, note]
 
     def _sentences(self) -> Sentences:
         """How to interpret the task column. Raises DatasetError for an unknown column or a broken task table."""
@@ -83,7 +101,10 @@ class LeRobotDataset(Dataset):
         if file is not None and not has_numbers(file, types, column):
             return Sentences(column)
         table, name = table_of(self.info, column)
-        return Sentences(column, str(table.relative_to(self.root).with_suffix("")), read_sentences(table, name))
+        sentences, shown = read_sentences(table, name), table.relative_to(self.root)
+        if list(sentences) != list(range(len(sentences))) and table.suffix == ".parquet":
+            self.notes = [*self.notes, f"tasks: {shown} is not in the order of {name}_index: {_BY_PLACE}"]
+        return Sentences(column, str(shown.with_suffix("")), sentences)
 
     def _types_of_rows(self) -> tuple[Path | None, Mapping[str, str]]:
         """The first readable row table, and its column types."""

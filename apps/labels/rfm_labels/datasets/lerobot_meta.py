@@ -39,7 +39,9 @@ class Info:
     videos, images: cameras with frames in video files, and in tables
     depth: depth cameras among both
     left_out: other cameras, with the reason
+    total_frames: over all episodes
     data_path, video_path: file path templates
+    notes: lines for the caller
     """
 
     root: Path
@@ -49,15 +51,22 @@ class Info:
     images: tuple[str, ...]
     depth: tuple[str, ...]
     left_out: Mapping[str, str]
+    total_episodes: int
+    total_frames: int
     chunks_size: int
     data_path: str
     video_path: str | None
+    notes: Sequence[str]
 
     @classmethod
     def read(cls, root: Path) -> Info:
         """Read the information in ``root``. Raises DatasetError."""
         file = root / INFO_FILE
         document = json_object(file)
+        notes: list[str] = []
+        if "codebase_version" not in document:
+            document["codebase_version"] = version = "v3.0" if (root / EPISODES_FOLDER).is_dir() else "v2.1"
+            notes = [f"version: {version}, by the files of meta, since info.json has no codebase_version"]
 
         def field(name: str, *kinds: type) -> Any:
             value = document.get(name)
@@ -83,9 +92,12 @@ class Info:
             images,
             depth=tuple(key for key in (*videos, *images) if _is_depth(features[key])),
             left_out=left_out,
+            total_episodes=field("total_episodes", int),
+            total_frames=field("total_frames", int),
             chunks_size=field("chunks_size", int),
             data_path=field("data_path", str),
             video_path=field("video_path", str) if videos else None,
+            notes=notes,
         )
 
     def path(self, template: str | None, **values: Any) -> Path:
@@ -223,19 +235,23 @@ def _entry_v30(info: Info, where: str, index: int, row: Mapping[str, Any]) -> En
 
 def _video(info: Info, where: str, row: Mapping[str, Any], key: str) -> tuple[Path, float] | DatasetError:
     """A camera's video and the episode's start in it, or a fault, which counts only if the camera is used."""
-    values = {name: row[f"videos/{key}/{name}"] for name in _VIDEO_COLUMNS}
+    names = [f"videos/{key}/{name}" for name in _VIDEO_COLUMNS]
     try:
-        for name, value in values.items():
+        for name in names:
             got = "none: leave this camera out (--cameras), or the episode (--episodes)"
-            require(f"{where}: videos/{key}/{name}", value is not None, "a value", got)
-        chunk, number, from_s, to_s = values.values()
-        lasts_s, expected_s = to_s - from_s, row["length"] / info.fps
-        is_long_enough = lasts_s >= expected_s - 0.5 / info.fps  # longer: includes frames from a discarded take
-        expected = f"{expected_s:.4f} s for {row['length']} frames"
-        require(f"{where}: videos/{key}: from_timestamp to to_timestamp", is_long_enough, expected, f"{lasts_s:.4f} s")
-        return info.path(info.video_path, video_key=key, chunk_index=chunk, file_index=number), float(from_s)
+            require(f"{where}: {name}", row[name] is not None, "a value", got)
+        return _place(info, where, row, key)
     except DatasetError as error:
         return error
+
+
+def _place(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float]:
+    chunk, number, from_s, to_s = (row[f"videos/{key}/{name}"] for name in _VIDEO_COLUMNS)
+    lasts_s, expected_s = to_s - from_s, row["length"] / info.fps
+    is_long_enough = lasts_s >= expected_s - 0.5 / info.fps  # longer: includes frames from a discarded take
+    expected = f"{expected_s:.4f} s for {row['length']} frames"
+    require(f"{where}: videos/{key}: from_timestamp to to_timestamp", is_long_enough, expected, f"{lasts_s:.4f} s")
+    return info.path(info.video_path, video_key=key, chunk_index=chunk, file_index=number), float(from_s)
 
 
 def json_lines(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
