@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
@@ -13,13 +12,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
-from rfm_client.contract.checks import checked_count, require
+from rfm_client.contract.checks import require
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import (
     ClientClosedError,
     DeadlineExceededError,
     InferenceFailedError,
-    InvalidValueError,
     ModelNotFoundError,
     RewardError,
 )
@@ -34,10 +32,8 @@ from rfm_client.contract.samples import (
     with_pictures,
 )
 from rfm_client.contract.wire import DEFAULT_MODEL, PROBE_PREFIX, Part, encoder_name, frames_name
-from rfm_client.episodes.episodes import AsyncEpisode, AsyncEpisodes
-from rfm_client.episodes.options import EpisodeOptions, StepKeywords, StepScore
+from rfm_client.episodes.options import StepScore
 from rfm_client.episodes.scorer import Asked, StepScorer
-from rfm_client.episodes.steps import Steps
 from rfm_client.frames.fit_to_checkpoint import resize_frames
 from rfm_client.frames.sampling import Sampling
 from rfm_client.scoring.samples import Call, CallOptions, SampleScorer, results_of
@@ -202,32 +198,14 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         outcomes = await self._scorer.outcomes(samples, self._call(options))
         return outcomes if return_errors else results_of(outcomes, "samples[{}]" if len(samples) > 1 else "")
 
-    def episode(self, task: str, *, env: int | None = None, **options: Unpack[StepKeywords]) -> AsyncEpisode:
-        """Return an episode to score step by step. A step sends only the new frame if the server caches features.
+    async def score_steps(
+        self, asked: Sequence[Asked], asked_s: float, *, timeout_s: float | None = None
+    ) -> list[StepScore]:
+        """Score episodes at the steps asked for, with as few requests as possible. Raises RewardError.
 
-        env: environment index, shown in errors as ``envs[3]``; None: the only one
-        options: EpisodeOptions fields. Raises ValueError for contradictory options
+        asked_s: when the caller began to wait, by ``time.perf_counter``
         """
-        where = "" if env is None else f"envs[{checked_count('env', env, least=0)}]"
-        steps = Steps(task, EpisodeOptions(**options), where)
-        return AsyncEpisode(AsyncEpisodes(self._steps, self._call, [steps]))
-
-    def episodes(self, num: int, task: str | Sequence[str], **options: Unpack[StepKeywords]) -> AsyncEpisodes:
-        """Return ``num`` parallel episodes, as in vectorised environments. A step sends as few requests as possible.
-
-        task: one sentence for all episodes, or one per episode
-        options: as in ``episode``
-        """
-        tasks = [task] * num if isinstance(task, str) else list(task)
-        if len(tasks) != num:
-            raise InvalidValueError.at("task", f"one for each of {num} episodes", len(tasks))
-        each, where = EpisodeOptions(**options), "episodes[{}]" if num > 1 else ""
-        steps = [Steps(sentence, each, where.format(env)) for env, sentence in enumerate(tasks)]
-        return AsyncEpisodes(self._steps, self._call, steps)
-
-    async def score_steps(self, asked: Sequence[Asked]) -> list[StepScore]:
-        """Score episodes at their newest steps, with as few requests as possible. Raises RewardError."""
-        return await self._steps.scores(asked, self._call({}), time.perf_counter())
+        return await self._steps.scores(asked, self._call({"timeout_s": timeout_s}), asked_s)
 
     async def encode(
         self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 import weakref
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future
@@ -10,13 +11,15 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 from rfm_client.async_client import AsyncRewardClient, ClientOptions
+from rfm_client.contract.checks import checked_count, require
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.contract.wire import Part
 from rfm_client.episodes.episodes import Episode, Episodes
-from rfm_client.episodes.options import StepKeywords, StepScore
+from rfm_client.episodes.options import EpisodeOptions, StepKeywords, StepScore
+from rfm_client.episodes.steps import Steps
 from rfm_client.frames.fit_to_checkpoint import snapshot
 from rfm_client.frames.sampling import Sampling
 from rfm_client.scoring.samples import CallOptions
@@ -103,7 +106,8 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         env: environment index, shown in errors as ``envs[3]``; None: the only one
         options: EpisodeOptions fields. Raises ValueError for contradictory options
         """
-        return Episode(self._client.episode(task, env=env, **options), self._loop, self)
+        where = "" if env is None else f"envs[{checked_count('env', env, least=0)}]"
+        return Episode(self._episodes([Steps(task, EpisodeOptions(**options), where)]))
 
     def episodes(self, num: int, task: str | Sequence[str], **options: Unpack[StepKeywords]) -> Episodes:
         """Return ``num`` parallel episodes, as in vectorised environments. A step sends as few requests as possible.
@@ -111,18 +115,22 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         task: one sentence for all episodes, or one per episode
         options: as in ``episode``
         """
-        return Episodes(self._client.episodes(num, task, **options), self._loop, self)
+        tasks = [task] * num if isinstance(task, str) else list(task)
+        require("task", len(tasks) == num, f"one for each of {num} episodes", len(tasks))
+        each, where = EpisodeOptions(**options), "episodes[{}]" if num > 1 else ""
+        return self._episodes([Steps(sentence, each, where.format(env)) for env, sentence in enumerate(tasks)])
 
     def score_episodes(self, episodes: Sequence[Episode]) -> list[StepScore]:
         """Score all episodes at their newest frames, with as few requests as possible. Raises RewardError.
 
         Frames come from ``Episode.keep``, and stay in the episodes after a failure.
         """
-        return self._loop.wait(self._client.score_steps([each.asked for each in episodes]))
+        return self._loop.wait(self._client.score_steps([each.asked for each in episodes], time.perf_counter()))
 
     def submit_episodes(self, episodes: Sequence[Episode]) -> Future[list[StepScore]]:
         """Start ``score_episodes`` and return a future at once. Frames kept later do not change the scores."""
-        future = self._loop.start(self._client.score_steps([each.asked for each in episodes]))
+        asked = [each.asked for each in episodes]
+        future = self._loop.start(self._client.score_steps(asked, time.perf_counter()))
         future.add_done_callback(lambda _done: self)
         return future
 
@@ -162,6 +170,9 @@ class RewardClient(ClientOptions, Closing, OneProcess):
     def close(self) -> None:
         """End running calls, which raise ClientClosedError, close the connections and release shared memory."""
         self._finalizer()
+
+    def _episodes(self, steps: list[Steps]) -> Episodes:
+        return Episodes(self._client, self._loop, self, steps)
 
 
 def _close(client: AsyncRewardClient, loop: LoopThread) -> None:

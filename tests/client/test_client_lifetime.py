@@ -76,7 +76,6 @@ HOLDERS: dict[str, Callable[[RewardClient], Any]] = {
     "AsyncRewardClient": lambda client: AsyncRewardClient(NOBODY),
     "Episode": lambda client: client.episode("lift"),
     "Episodes": lambda client: client.episodes(2, "lift"),
-    "AsyncEpisode": lambda client: AsyncRewardClient(NOBODY).episode("lift"),
     "RewardModelWrapper": lambda client: RewardModelWrapper(
         gymnasium.make("CartPole-v1", render_mode="rgb_array"), client, "lift"
     ),

@@ -15,7 +15,6 @@ import pytest
 import transports
 from engine_server import EngineServer
 from rfm_client import (
-    AsyncRewardClient,
     FrameSize,
     InvalidSampleError,
     ProgressResult,
@@ -237,52 +236,6 @@ def test_a_frame_that_is_wrong_leaves_the_episode_as_it_was(client: RewardClient
     with pytest.raises(InvalidSampleError, match=r"^episodes\[1\]\.frame: expected uint8 \[H, W, 3\]"):
         episodes.add([frames[0], np.zeros((2, 2, 3))])
     assert episodes.add(frames[:2]).step.tolist() == [0, 0]
-
-
-def test_the_newest_frame_takes_the_place_of_one_that_waits(client: RewardClient) -> None:
-    frames, episode = video(108, 30), client.episode(TASK, frames=4)
-    answers = [episode.add_nowait(frame) for frame in frames]
-    score = answers[-1].result()
-    taken = [index for index, answer in enumerate(answers) if not answer.cancelled()]
-    assert score.step == len(taken) - 1
-    assert (taken[0], taken[-1]) == (0, len(frames) - 1)
-    assert 1 < len(taken) < len(frames)
-    expected = offline(client, frames[taken])
-    np.testing.assert_allclose(score.progress, expected.progress[-1], atol=TOLERANCE)
-    with pytest.raises(InvalidSampleError, match="frame: expected uint8"):
-        episode.add_nowait(np.zeros((2, 2, 3))).result()
-    episode.reset("open the drawer")
-    assert episode.add(frames[0]).step == 0
-
-
-def test_frames_stay_in_the_order_in_which_they_were_added(engines: EngineServer, client: RewardClient) -> None:
-    """With and without waiting, with a reset in between, and after a caller stops waiting."""
-    frames = video(113, 5)
-
-    async def play() -> tuple[list[float], list[int]]:
-        async with AsyncRewardClient(engines.url, model=MODEL) as client:
-            episode = client.episode(TASK, frames=4)
-            open_, waiting = episode.add_nowait(frames[0]), episode.add_nowait(frames[3])
-            second = await episode.add(frames[1])
-            assert open_.done()
-            assert waiting.cancelled()
-            buffer = frames[2].copy()
-            third = episode.add_nowait(buffer)
-            buffer[:] = 0  # drawn over before it was sent
-            await episode.reset()
-            again = episode.add_nowait(frames[0])
-            reset = asyncio.create_task(episode.reset())
-            await asyncio.sleep(0)
-            reset.cancel()
-            await again  # no answer is lost
-            episode.add_nowait(frames[3]).cancel()  # then it is not part of the episode
-            scores = [open_.result(), second, third.result(), again.result(), await episode.add(frames[4])]
-            return [score.progress for score in scores], [score.step for score in scores]
-
-    progress, steps = asyncio.run(play())
-    assert steps == [0, 1, 2, 0, 1]
-    expected = [*offline(client, frames[:3]).progress, *offline(client, frames[[0, 4]]).progress]
-    np.testing.assert_allclose(progress, expected, rtol=0, atol=TOLERANCE)
 
 
 def test_an_episode_keeps_its_client(engines: EngineServer) -> None:

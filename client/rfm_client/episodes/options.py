@@ -28,7 +28,7 @@ class StepScore:
     success: probability that the task is done; NaN: the checkpoint does not predict success
     succeeded: True if the success rule holds; False where success is NaN
     step: the scored frame's index in the episode, from 0
-    ms: milliseconds to the answer, without the wait for an open ``add_nowait`` request
+    ms: milliseconds to the answer
     more_scores: other scores for the frame, by name in ``FRAME_SCORES``: marks as bool, numbers as float. With several
         cameras, numbers are fused, and a mark is True if any camera has it
     """

@@ -189,14 +189,7 @@ def check_cameras(where: str, frames: Any, cameras: Sequence[str]) -> None:
 
 def checked_frame(frame: Any, where: str) -> UInt8Array:
     """Copy a frame, uint8 [H, W, 3], so that the caller may reuse the array. Raises InvalidSampleError."""
-    kept = copied(frame)
+    kept = np.array(as_array(frame))
     is_frame = kept.dtype == np.uint8 and kept.ndim == 3 and kept.shape[2] == 3 and 0 not in kept.shape
     require(where, is_frame, "uint8 [H, W, 3]", f"{kept.dtype} {list(kept.shape)}", InvalidSampleError)
     return cast(UInt8Array, kept)
-
-
-def copied(frame: Any) -> Any:
-    """Copy a frame, or a dict of frames by camera."""
-    if isinstance(frame, Mapping):
-        return {camera: np.array(as_array(each)) for camera, each in frame.items()}
-    return np.array(as_array(frame))
