@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 import clip
-from client_commands import MODEL, TASK, WIDTHS, ask, assert_scores, columns, invoke, rows, run
+from client_commands import MODEL, TASK, WIDTHS, ask, assert_scores, columns, invoke, run
 from engine_server import EngineServer
 from rfm_client import (
     FrameScores,
@@ -25,7 +25,7 @@ from rfm_client import (
     Trajectory,
     load_trajectory,
 )
-from rfm_client.cli.comparing import LEGEND, Comparison, compare
+from rfm_client.cli.comparing import NO_VERDICT, Comparison, compare
 from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.pictures import Panel, plot
 from rfm_client.cli.scoring import Source
@@ -132,41 +132,30 @@ def test_score_reads_videos_behind_urls(engines: EngineServer, video: Path) -> N
     assert remote["frame_times_s"] is None
 
 
-def test_compare_asks_both_orders_of_every_two_videos_and_shows_the_scores_of_score(
-    served: Served, video: Path, tmp_path: Path
-) -> None:
-    random = np.random.default_rng(0)
-    small, third = tmp_path / "small.npy", tmp_path / "third.npy"
-    np.save(small, random.integers(0, 256, (20, 40, 30, 3), np.uint8))
-    np.save(third, random.integers(0, 256, (3, 40, 30, 3), np.uint8))
-    files = [video, small, third]
-    target = tmp_path / "scores.json"
+def test_compare_asks_in_both_orders_and_shows_the_scores_of_score(served: Served, video: Path, tmp_path: Path) -> None:
+    small, target = tmp_path / "small.npy", tmp_path / "scores.json"
+    np.save(small, np.random.default_rng(0).integers(0, 256, (20, 40, 30, 3), np.uint8))
+    files = [video, small]
     asked_of = ("--task", TASK, "--url", served.url("grpc"), "--model", MODEL)
-    result = invoke("compare", *files, *asked_of, "--json", target, "--plot", tmp_path / "all.svg")
+    result = invoke("compare", *files, *asked_of, "--json", target, "--plot", tmp_path / "both.svg")
     told = f"rfm-client: note: {small}: 16 of 20 frames were scored, evenly spaced\n"
     assert (result.exit_code, result.stderr) == (0, told)
-    trajectories = [load_trajectory(video, task=TASK, fps=3), *(load_trajectory(f, task=TASK) for f in files[1:])]
-    orders = [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)]
+    first, second = load_trajectory(video, task=TASK, fps=3), load_trajectory(small, task=TASK)
     with served.client("grpc", MODEL) as client:
-        asked = {order: client.preference(*(trajectories[i] for i in order), subsample=True) for order in orders}
+        asked = client.preference(first, second, subsample=True).preference
+        swapped = 1 - client.preference(second, first, subsample=True).preference
     document = json.loads(target.read_text())
-    assert document.keys() & {"first", "second", "preference"} == set()  # which two videos have
-    assert [(Path(each["first"]), Path(each["second"])) for each in document["orders"]] == [
-        (files[first], files[second]) for first, second in orders
-    ]
-    told_preferences = [each["preference"] for each in document["orders"]]
-    np.testing.assert_allclose(told_preferences, [each.preference for each in asked.values()], rtol=0, atol=TOLERANCE)
-    shares = {(a, b): (asked[a, b].preference + 1 - asked[b, a].preference) / 2 for a, b in orders}
+    np.testing.assert_allclose(document["both_orders"], [asked, swapped], rtol=0, atol=TOLERANCE)
+    wins = (sum(document["both_orders"]) / 2, 1 - sum(document["both_orders"]) / 2)
     scored = json.loads(invoke("score", *files, *asked_of, "--json").stdout)["videos"]
-    for index, each in enumerate(document["videos"]):
-        wins = np.mean([share for (a, _), share in shares.items() if a == index])
-        assert (each["source"], each["wins"]) == (str(files[index]), pytest.approx(wins, abs=TOLERANCE))
+    for each, alone, file, share in zip((document["first"], document["second"]), scored, files, wins, strict=True):
+        assert each["source"] == str(file)
         for name in ("progress", "success"):
-            np.testing.assert_allclose(each[name], scored[index][name], rtol=0, atol=TOLERANCE)
-        figures = [f"{figure:.4f}" for figure in (each["wins"], each["progress"][-1], each["success"][-1])]
-        assert rows(result.stdout, str(files[index]))[0][2:] == [*figures, str(len(each["progress"]))]
-    assert document["videos"][1]["frame_indices"] == np.rint(np.linspace(0, 19, 16)).astype(int).tolist()
-    assert (tmp_path / "all.svg").read_text().startswith("<?xml")
+            np.testing.assert_allclose(each[name], alone[name], rtol=0, atol=TOLERANCE)
+        figures = [f"{figure:.4f}" for figure in (share, each["progress"][-1], each["success"][-1])]
+        assert columns(result.stdout, str(file))[1:] == [*figures, str(len(each["progress"]))]
+    assert document["second"]["frame_indices"] == np.rint(np.linspace(0, 19, 16)).astype(int).tolist()
+    assert (tmp_path / "both.svg").read_text().startswith("<?xml")
 
 
 def test_compare_of_two_videos_has_their_preference_and_verdict(engines: EngineServer, tmp_path: Path) -> None:
@@ -184,7 +173,6 @@ def test_compare_of_two_videos_has_their_preference_and_verdict(engines: EngineS
     assert_scores(document["first"], alone[0])
     assert_scores(document["second"], alone[1])
     assert (document["verdict"], document["orders_agree"]) == (expected.verdict, expected.orders_agree)
-    assert (document["ranking"] is None) == (not expected.orders_agree)
     assert (tmp_path / "both.pdf").read_bytes().startswith(b"%PDF")
 
 
@@ -192,7 +180,7 @@ def test_compare_refuses_the_answers_of_two_versions(tmp_path: Path, video: Path
     np.save(tmp_path / "small.npy", np.zeros((2, 40, 30, 3), np.uint8))  # of another size: a separate request
     with (
         RewardClient("", transports=[Shelf(after=1)]) as client,
-        pytest.raises(InferenceFailedError, match=r"^model_version: expected one for all videos, got 1, 2: ask again$"),
+        pytest.raises(InferenceFailedError, match=r"^model_version: expected one for both orders, got 2, 1: ask again$"),
     ):
         compare(client, [str(video), str(tmp_path / "small.npy")], VideoOptions(task=TASK))
 
@@ -210,39 +198,22 @@ def test_a_plot_has_a_strip_for_each_video_and_is_drawn_without_scores_too(tmp_p
     assert (np.diff(middles) >= float(corners[0][1])).all()
 
 
-ORDERS: dict[str, tuple[dict[tuple[int, int], float], list[int | None], list[int] | None, list[str]]] = {
-    "agree": ({(0, 1): 0.4, (1, 0): 0.9}, [2, 1], [1, 0], ["agree"]),
-    "disagree by a hair": ({(0, 1): 0.5001, (1, 0): 0.5001}, [None, None], None, ["no answer"]),
-    "both are even": ({(0, 1): 0.5, (1, 0): 0.5}, [None, None], None, ["no answer"]),
-    "the third loses to either": (
-        {(0, 1): 0.9, (1, 0): 0.9, (0, 2): 0.9, (2, 0): 0.1, (1, 2): 0.8, (2, 1): 0.2},
-        [None, None, 3],
-        None,
-        ["no answer", "agree", "agree"],
-    ),
-    "of three": (
-        {(0, 1): 0.3, (1, 0): 0.9, (0, 2): 0.2, (2, 0): 0.8, (1, 2): 0.6, (2, 1): 0.3},
-        [3, 1, 2],
-        [1, 2, 0],
-        ["agree", "agree", "agree"],
-    ),
+ORDERS = {
+    "agree": (0.4, 0.9, "The second video does the task better."),
+    "disagree by a hair": (0.5001, 0.5001, NO_VERDICT),
+    "both are even": (0.5, 0.5, NO_VERDICT),
+    "the first wins": (0.9, 0.2, "The first video does the task better."),
 }
 
 
-@pytest.mark.parametrize(("preferences", "ranks", "ranking", "answers"), ORDERS.values(), ids=ORDERS)
-def test_a_comparison_names_no_winner_where_the_orders_disagree(
-    preferences: dict[tuple[int, int], float], ranks: list[int | None], ranking: list[int] | None, answers: list[str]
-) -> None:
+@pytest.mark.parametrize(("asked", "swapped", "verdict"), ORDERS.values(), ids=ORDERS)
+def test_a_comparison_names_no_winner_where_the_orders_disagree(asked: float, swapped: float, verdict: str) -> None:
     scores = ProgressResult(progress=np.zeros(2, np.float32), success=np.zeros(2, np.float32))
-    seen = random_trajectory(0, 2, *WIDTHS)
-    comparison = Comparison(
-        [Source(f"{index}.npz", seen, None) for index in range(len(ranks))],
-        [scores] * len(ranks),
-        {order: PreferenceResult(preference=each, first=scores, second=scores) for order, each in preferences.items()},
-    )
-    assert (comparison.ranks, comparison.ranking) == (ranks, ranking)
-    of_videos, of_pairs, *legend = comparison.tables()
-    found = [re.search(r"^  \d\.npz +(\S+)", line) for line in of_videos.splitlines()]
-    assert [each[1] for each in found if each] == [str(ranks[index] or "?") for index in ranking or range(len(ranks))]
-    assert re.findall(r"  (agree|no answer)$", of_pairs, re.MULTILINE) == answers
-    assert legend == [LEGEND] * (ranking is None)
+    sources = [Source(f"{index}.npz", random_trajectory(0, 2, *WIDTHS), None) for index in range(2)]
+    orders = [PreferenceResult(preference=each, first=scores, second=scores) for each in (asked, swapped)]
+    shown = Comparison(sources, [scores] * 2, PreferenceResult.of_both_orders(*orders)).shown()
+    told = f"P(first wins) = {asked:.4f}, with the order swapped {1 - swapped:.4f}."
+    assert shown.splitlines()[-2:] == [told, verdict]
+    assert [columns(shown, f"{index}.npz")[1] for index in range(2)] == [
+        f"{share:.4f}" for share in ((asked + 1 - swapped) / 2, (1 - asked + swapped) / 2)
+    ]

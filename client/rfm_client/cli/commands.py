@@ -51,8 +51,6 @@ from rfm_client.contract.results import FRAME_SCORES
 from rfm_client.contract.wire import frames_name
 from rfm_client.plot import save
 
-MIN_COMPARED = 2
-
 app = typer.Typer(
     name="rfm-client",
     cls=Commands,
@@ -66,7 +64,7 @@ app = typer.Typer(
 
 _APPLICATIONS = {"evaluate": "labels", "gateway": "gateway", "label": "labels"}  # the package for each command
 
-VIDEOS = "Videos, .npy or .npz files, or URLs of videos."
+VIDEO = "Video, .npy or .npz file, or URL of a video."
 
 
 def _print_version(is_wanted: bool) -> None:
@@ -88,7 +86,7 @@ def main(
 @app.command(cls=Command, epilog=EXIT_CODES)
 @with_options
 def score(
-    videos: Annotated[list[str], typer.Argument(metavar="VIDEO...", help=VIDEOS)],
+    videos: Annotated[list[str], typer.Argument(metavar="VIDEO...", help=VIDEO)],
     video: ScoredVideos,
     prefix: PrefixOptions,
     output: OutputOptions,
@@ -132,28 +130,27 @@ def score(
 @app.command(cls=Command, epilog=EXIT_CODES)
 @with_options
 def compare(
-    videos: Annotated[list[str], typer.Argument(metavar="VIDEO VIDEO...", help=VIDEOS)],
+    first: Annotated[str, typer.Argument(help=VIDEO)],
+    second: Annotated[str, typer.Argument(help="The other one.")],
     video: VideoOptions,
     output: PlotOutput,
     server: ServerOptions,
 ) -> None:
-    """Rank several videos by how well they do the task.
+    """Tell which of two videos does the task better.
 
-    Every two videos are compared in both orders. The rank follows the mean probability of winning against the others.
-    A video has no rank ("?") if the orders disagree about one of its pairs. The table also shows progress at the end.
+    The model is asked in both orders. There is no verdict if the orders disagree. The table also shows progress at the
+    end.
 
     Example: rfm-client compare a.mp4 b.mp4 --task "put the block in the bowl"
     """
-    if len(videos) < MIN_COMPARED:
-        raise typer.BadParameter(f"expected at least {MIN_COMPARED} videos, got {len(videos)}", param_hint="VIDEO")
-    output.begin(videos)
+    output.begin([first, second])
     with server.connected() as client:
-        comparison = comparing.compare(client, videos, video)
+        comparison = comparing.compare(client, (first, second), video)
         checkpoint = scoring.checkpoint_of(client, comparison.sources[0].trajectory)
     for source, scores in zip(comparison.sources, comparison.scores, strict=True):
         _report_subsampled(source.name, len(scores.progress), source.trajectory.num_frames)
     if output.prints_tables:
-        typer.echo("\n".join(comparison.tables()))
+        typer.echo(comparison.shown())
     output.write_json(documents.comparison_document(server, video, comparison))
     if output.plot is not None:
         from rfm_client.cli.pictures import plot

@@ -1,18 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""``rfm-client compare``: rank videos by how well they do a task.
+"""``rfm-client compare``: which of two videos does a task better, asked in both orders.
 
-A model's preference may depend on the order of the two videos, so every pair is compared in both orders. If the orders
-disagree, the pair has no verdict.
+A model's preference may depend on the order of the videos. If the orders disagree, there is no verdict.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import PurePath
-from statistics import fmean
 from typing import cast
 
 from rfm_client.cli.options import VideoOptions
@@ -22,129 +18,62 @@ from rfm_client.cli.show import at_end, number, table
 from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError
 from rfm_client.contract.results import PreferenceResult, ProgressResult
-from rfm_client.contract.samples import PreferenceSample, ProgressSample, Trajectory
-from rfm_client.frames.fit_to_checkpoint import fitted, with_frame_indices
+from rfm_client.contract.samples import PreferenceSample, ProgressSample
+from rfm_client.scoring.samples import CallOptions
 
-LEGEND = (
-    "no answer: the orders disagree, or both are exactly 0.5.\n"
-    "A video has no rank (?) if one of its pairs has no answer."
-)
-
-Order = tuple[int, int]  # indices of the first and second video in a question
+NO_VERDICT = "No verdict: the orders disagree, or both are exactly 0.5."
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """N sources, their scores, and their preferences from one model version.
+    """Two sources, and what one model version says about them.
 
     scores: for each source alone, as from ``score``; in a preference they depend on the other source
-    results: for both orders of every pair
+    preference: from both orders
     """
 
     sources: Sequence[Source]
     scores: Sequence[ProgressResult]
-    results: Mapping[Order, PreferenceResult]
-
-    def pair(self, first: int, second: int) -> PreferenceResult:
-        """Return both orders for two sources as one result."""
-        return PreferenceResult.of_both_orders(self.results[first, second], self.results[second, first])
-
-    def couples(self) -> Iterator[Order]:
-        """Yield every pair of sources once, in the given order."""
-        return itertools.combinations(self._numbers, 2)
-
-    @cached_property
-    def wins(self) -> list[float]:
-        """Each source's mean probability of winning, averaged over opponents and orders."""
-        return [
-            fmean(self.pair(index, other).preference for other in self._numbers if other != index)
-            for index in self._numbers
-        ]
-
-    @cached_property
-    def ranks(self) -> list[int | None]:
-        """Each source's rank by ``wins``, from 1; None if a pair with this source has no verdict."""
-        best_first = sorted(self._numbers, key=self.wins.__getitem__, reverse=True)
-        unranked = {index for couple in self.couples() if self.pair(*couple).verdict is None for index in couple}
-        return [None if index in unranked else best_first.index(index) + 1 for index in self._numbers]
+    preference: PreferenceResult
 
     @property
-    def ranking(self) -> list[int] | None:
-        """Source indices, best first; None if a pair has no verdict."""
-        if None in self.ranks:
-            return None
-        return sorted(self._numbers, key=lambda index: cast(int, self.ranks[index]))
+    def wins(self) -> tuple[float, float]:
+        """Each source's probability of winning, averaged over both orders."""
+        return self.preference.preference, 1 - self.preference.preference
 
-    def tables(self) -> list[str]:
-        """Return a table of sources, best first, a table of pairs, and without a ranking a legend."""
-        columns = ("video", "rank", "P(wins)", "final progress", "final success", "frames")
-        pairs = ("first", "second", "P(first wins)", "order swapped", "mean", "orders")
-        return [
-            table("", columns, [self._row(index) for index in self._shown]),
-            table("", pairs, [self._pair_row(*couple) for couple in self.couples()], names=2),
-            *([LEGEND] if self.ranking is None else []),
+    def shown(self) -> str:
+        """Return a table with a row for each source, and below it the verdict."""
+        columns = ("video", "P(wins)", "final progress", "final success", "frames")
+        rows = [
+            (source.name, number(wins), at_end(scores), number(scores.success[-1]), str(len(scores.progress)))
+            for source, scores, wins in zip(self.sources, self.scores, self.wins, strict=True)
         ]
+        verdict = self.preference.verdict
+        told = NO_VERDICT if verdict is None else f"The {verdict} video does the task better."
+        asked, swapped = map(number, self.preference.both_orders or ())
+        return f"{table('', columns, rows)}\nP(first wins) = {asked}, with the order swapped {swapped}.\n{told}"
 
     def panels(self) -> list[Panel]:
-        """Return a plot panel for each source, in table order."""
+        """Return a plot panel for each source."""
         return [
-            self.sources[index].panel(
-                f"{self._rank(index)}. {PurePath(self.sources[index].name).name}: wins with P = {self.wins[index]:.3f}",
-                self.scores[index],
-            )
-            for index in self._shown
+            source.panel(f"{PurePath(source.name).name}: wins with P = {wins:.3f}", scores)
+            for source, scores, wins in zip(self.sources, self.scores, self.wins, strict=True)
         ]
-
-    @property
-    def _numbers(self) -> range:
-        return range(len(self.sources))
-
-    @property
-    def _shown(self) -> Sequence[int]:
-        return self.ranking or self._numbers
-
-    def _rank(self, index: int) -> str:
-        return str(self.ranks[index] or "?")
-
-    def _row(self, index: int) -> tuple[str, ...]:
-        scores = self.scores[index]
-        figures = (number(self.wins[index]), at_end(scores), number(scores.success[-1]))
-        return (self.sources[index].name, self._rank(index), *figures, str(len(scores.progress)))
-
-    def _pair_row(self, first: int, second: int) -> tuple[str, ...]:
-        pair = self.pair(first, second)
-        names = (self.sources[index].name for index in (first, second))
-        orders = "agree" if pair.verdict else "no answer"
-        return (*names, *map(number, (*(pair.both_orders or ()), pair.preference)), orders)
 
 
 def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> Comparison:
-    """Compare every two sources on the first one's task. Raises RewardError."""
+    """Compare two sources on the first one's task. Raises RewardError."""
     sources = [Source.read(name, video) for name in names]
-    trajectories = [_of_one_task(sources[0], source) for source in sources]
-    info = client.model_info(frames=trajectories[0].frames is not None)
-    limits = info.max_frames if video.subsample else None, info.frame_size if video.resize else None
-    fits = [fitted(ProgressSample(trajectory), *limits) for trajectory in trajectories]  # once, not for every pair
-    sent = [fit.sample.trajectories[0] for fit in fits]
-    orders = list(itertools.permutations(range(len(sources)), 2))
-    answers = client.evaluate([PreferenceSample(sent[first], sent[second]) for first, second in orders])
-    alone = client.evaluate([fit.sample for fit in fits], all_scores=True)
-    scores = [
-        cast(ProgressResult, with_frame_indices(each, fit.frame_indices)) for each, fit in zip(alone, fits, strict=True)
-    ]
-    versions = sorted({str(result.model_version) for result in (*scores, *answers)})
+    first, second = (source.trajectory for source in sources)
+    try:
+        PreferenceSample(first, second)
+    except InvalidSampleError as error:
+        raise InvalidSampleError(f"{' and '.join(names)}: {error}") from error
+    second = replace(second, task=first.task, text_embedding=first.text_embedding)
+    options: CallOptions = {"subsample": video.subsample, "resize": video.resize}
+    preference = client.preference(first, second, both_orders=True, **options)
+    alone = client.evaluate([ProgressSample(first), ProgressSample(second)], all_scores=True, **options)
+    versions = sorted({str(result.model_version) for result in (preference, *alone)})
     if len(versions) > 1:
         raise InferenceFailedError(f"model_version: expected one for all videos, got {', '.join(versions)}: ask again")
-    return Comparison(sources, scores, dict(zip(orders, cast("list[PreferenceResult]", answers), strict=True)))
-
-
-def _of_one_task(first: Source, other: Source) -> Trajectory:
-    """Return the other's trajectory with the first's task, so that both orders share a task."""
-    if other is first:
-        return first.trajectory
-    try:
-        PreferenceSample(first.trajectory, other.trajectory)
-    except InvalidSampleError as error:
-        raise InvalidSampleError(f"{first.name} and {other.name}: {error}") from error
-    asked = first.trajectory
-    return replace(other.trajectory, task=asked.task, text_embedding=asked.text_embedding)
+    return Comparison(sources, cast("list[ProgressResult]", alone), preference)

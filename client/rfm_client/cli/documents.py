@@ -17,15 +17,12 @@ from rfm_client.contract.errors import RewardError
 from rfm_client.contract.results import (
     FRAME_SCORES,
     FrameScores,
-    PreferenceResult,
     ProgressResult,
     Result,
     answer,
     trajectory_scores,
 )
 from rfm_client.transport.status import ServerStatus
-
-SIDES = ("first", "second")  # in a comparison
 
 
 def score_document(
@@ -37,40 +34,20 @@ def score_document(
 
 
 def comparison_document(server: ServerOptions, video: VideoOptions, comparison: Comparison) -> dict[str, Any]:
-    """Return the document for ``compare --json``. ``preference`` is the probability that an order's first video wins.
+    """Return the document for ``compare --json``.
 
-    For two videos, the top level also has the ``preference`` in the given order, the verdict from both orders, and
-    scores as ``first`` and ``second``. Scores are those from ``score``. A missing verdict, rank or ranking is null.
+    ``preference`` is the probability that the first video wins, in the given order; ``both_orders`` has it from both
+    orders. A missing verdict is null. Scores are those from ``score``.
     """
-    names = [source.name for source in comparison.sources]
-    videos = [
-        {
-            "source": source.name,
-            "num_frames": source.trajectory.num_frames,
-            **frame_document(scores, source.times_of(scores)),
-            "wins": wins,
-            "rank": rank,
-        }
-        for source, scores, wins, rank in zip(
-            comparison.sources, comparison.scores, comparison.wins, comparison.ranks, strict=True
-        )
-    ]
-    orders = [
-        {"first": names[first], "second": names[second], "preference": result.preference}
-        for (first, second), result in comparison.results.items()
-    ]
-    pairs = [
-        {"first": names[first], "second": names[second], **_verdict(comparison.pair(first, second))}
-        for first, second in comparison.couples()
-    ]
-    asked = comparison.results[0, 1]
+    asked = comparison.preference
+    both_orders = list(asked.both_orders or ())
     document = {**server.origin, **_asked(video), "model_version": asked.model_version}
-    if len(videos) == len(SIDES):
-        document |= {"preference": asked.preference, **_verdict(comparison.pair(0, 1))}
-        document |= dict(zip(SIDES, videos, strict=True))
-    best_first = comparison.ranking
-    ranking = None if best_first is None else [videos[index] for index in best_first]
-    return {**document, "orders": orders, "pairs": pairs, "videos": videos, "ranking": ranking}
+    document |= {"preference": both_orders[0], "both_orders": both_orders}
+    document |= {"verdict": asked.verdict, "orders_agree": asked.orders_agree}
+    for name, source, scores in zip(("first", "second"), comparison.sources, comparison.scores, strict=True):
+        about = {"source": source.name, "num_frames": source.trajectory.num_frames}
+        document[name] = {**about, **frame_document(scores, source.times_of(scores))}
+    return document
 
 
 def samples_document(server: ServerOptions, kind: str, outcomes: Sequence[Result | RewardError]) -> dict[str, Any]:
@@ -130,10 +107,6 @@ def _outcome(outcome: Outcome) -> dict[str, Any]:
         return {"source": outcome.name, **_error(outcome.error, outcome.message)}
     about = {"source": outcome.name, "num_frames": outcome.num_frames, "took_s": outcome.took_s}
     return {**about, **result_document(outcome.result, (outcome.times_s,))}
-
-
-def _verdict(pair: PreferenceResult) -> dict[str, Any]:
-    return {"verdict": pair.verdict, "orders_agree": pair.orders_agree}
 
 
 def _error(error: Exception, message: str) -> dict[str, Any]:

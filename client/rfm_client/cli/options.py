@@ -288,9 +288,7 @@ class JsonOutput(Settings):
 class PlotOutput(JsonOutput):
     """Files that show a comparison."""
 
-    plot: Path | None = setting(
-        None, "Draw frames of each video above its scores, the best first: .png, .pdf or .svg.", metavar="FILE"
-    )
+    plot: Path | None = setting(None, "Draw frames of each video above its scores: .png, .pdf or .svg.", metavar="FILE")
 
     def begin(self, videos: Sequence[str]) -> None:
         """Raise ConfigError for a missing folder, and for more videos than the files can show."""
