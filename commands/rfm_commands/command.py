@@ -32,7 +32,7 @@ class RfmCommands(command.Commands):
     """Command group for ``rfm``, which refers to ``rfm-client`` for commands that exist only there."""
 
     other_program = "rfm-client"
-    others = ("score", "compare", "status", "wait", "sample", "bench-input", "evaluate")
+    others = ("score", "compare", "status", "wait", "sample", "evaluate")
 
 
 def say(line: str) -> None:

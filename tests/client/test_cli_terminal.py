@@ -7,6 +7,7 @@ import base64
 import importlib.metadata
 import json
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -18,16 +19,18 @@ import pytest
 import clip
 from client_commands import MODEL, RFM_CLIENT, TASK, ask, assert_scores, invoke
 from engine_server import EngineServer
-from rfm_client import FrameScores, ProgressResult
+from paths import ROOT
+from rfm_client import FrameScores, PreferenceSample, ProgressResult, ProgressSample, Sample
 from rfm_client.cli.documents import frame_document
 from rfm_client.cli.scoring import unique_stems
 from rfm_client.cli.show import shortened, status_tables
-from rfm_client.cli.synthetic import SyntheticSamples, parse_lengths
+from rfm_client.cli.synthetic import SyntheticSamples
 from rfm_client.command_line import ExitCode, number
 from rfm_client.contract.wire import encode_samples
 from rfm_client.serving import ServerStatus
 from rfm_client.transport.status import ModelStatus
 from servers import Endpoints
+from trajectories import random_trajectory
 
 WIDTH = 80  # of a terminal
 NAMES = ("episode_a.mp4", "episode_b.mp4")
@@ -106,16 +109,13 @@ SAMPLES = {"embeddings": ("progress", False), "pairs": ("similarity", False), "f
 
 
 @pytest.mark.parametrize(("kind", "use_frames"), SAMPLES.values(), ids=SAMPLES)
-def test_sample_and_bench_input_ask_for_the_same_samples(
-    engines: EngineServer, tmp_path: Path, kind: Any, use_frames: bool
-) -> None:
-    words = ["--sample-type", kind, "--num-samples", 3, "--num-frames", "2,5", "--seed", 5]
+def test_sample_scores_synthetic_samples(engines: EngineServer, kind: Any, use_frames: bool) -> None:
+    words = ["--sample-type", kind, "--num-samples", 3, "--num-frames", 5]
     words += ["--use-frames"] if use_frames else []
     result = ask(engines, "sample", *words, "--json", "-")
     assert (result.exit_code, result.stderr) == (0, "")
     with engines.client(MODEL) as client:
-        samples = SyntheticSamples(kind, 3, parse_lengths("2,5"), use_frames, seed=5).samples(client)
-        expected = client.evaluate(samples)
+        expected = client.evaluate(SyntheticSamples(kind, 3, 5, use_frames).samples(client))
     for answer, scores in zip(json.loads(result.stdout)["samples"], expected, strict=True):
         if isinstance(scores, ProgressResult):
             assert_scores(answer, scores)
@@ -124,12 +124,15 @@ def test_sample_and_bench_input_ask_for_the_same_samples(
             for name in ("first", "second") if kind == "preference" else ("reference", "other"):
                 assert_scores(answer[name], getattr(scores, name))
 
-    target = tmp_path / "input.json"
-    result = ask(engines, "bench-input", *words, "--output", target)
-    name = f"{MODEL}_frames" if use_frames else MODEL
-    command = f"perf_analyzer -m {name} -i grpc -u {engines.url.removeprefix('grpc://')} --input-data {target}"
-    assert result.stdout == f"{command} --async --concurrency-range 1:16:5\n"
-    for request, sample in zip(json.loads(target.read_text())["data"], samples, strict=True):
+
+def test_the_input_for_perf_analyzer_has_the_tensors_of_each_sample(tmp_path: Path) -> None:
+    samples: list[Sample] = [
+        ProgressSample(random_trajectory(0, 3)),
+        PreferenceSample(random_trajectory(1, 2), random_trajectory(2, 4)),
+    ]
+    write = runpy.run_path(str(ROOT / "benchmarks" / "perf_input.py"))["write"]
+    write(tmp_path / "input.json", samples)
+    for request, sample in zip(json.loads((tmp_path / "input.json").read_text())["data"], samples, strict=True):
         tensors = encode_samples([sample])
         assert request.keys() == tensors.keys()
         for tensor, array in tensors.items():  # as perf_analyzer reads them, with the batch axis that it adds
@@ -142,7 +145,7 @@ def test_sample_and_bench_input_ask_for_the_same_samples(
 
 
 def test_sample_shows_a_table_and_an_error_line_per_failed_sample(engines: EngineServer) -> None:
-    result = ask(engines, "sample", "--sample-type", "preference", "--num-samples", 2, "--num-frames", "3,17")
+    result = ask(engines, "sample", "--sample-type", "preference", "--num-samples", 2, "--num-frames", 17)
     assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
     for index, line in enumerate(result.stderr.splitlines()):
         assert line.startswith(f"rfm-client: samples[{index}]: num_frames: expected at most 16")

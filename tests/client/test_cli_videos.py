@@ -180,7 +180,9 @@ def test_compare_refuses_the_answers_of_two_versions(tmp_path: Path, video: Path
     np.save(tmp_path / "small.npy", np.zeros((2, 40, 30, 3), np.uint8))  # of another size: a separate request
     with (
         RewardClient("", transports=[Shelf(after=1)]) as client,
-        pytest.raises(InferenceFailedError, match=r"^model_version: expected one for both orders, got 2, 1: ask again$"),
+        pytest.raises(
+            InferenceFailedError, match=r"^model_version: expected one for both orders, got 2, 1: ask again$"
+        ),
     ):
         compare(client, [str(video), str(tmp_path / "small.npy")], VideoOptions(task=TASK))
 

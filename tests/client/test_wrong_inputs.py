@@ -82,9 +82,7 @@ USAGE = {
         "Invalid value: --metrics-url needs a single --url"
     ),
     "rfm-client compare a.mp4": "Missing argument 'SECOND'.",
-    "rfm-client sample --num-frames 8-4": bad(
-        "--num-frames", "expected a length (8), several (4,8,16) or a range (4-16), got '8-4'"
-    ),
+    "rfm-client sample --num-frames 8-4": bad("--num-frames", "expected a whole number, got '8-4'"),
     "rfm-client --task x score a.mp4": (
         "No such option: --task: it stands after the command, as in rfm-client score --task"
     ),

@@ -5,10 +5,8 @@ from __future__ import annotations
 
 import importlib.metadata
 import logging
-import shlex
 import time
 from importlib.metadata import entry_points
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -35,7 +33,6 @@ from rfm_client.cli.options import (
     StatusOptions,
     VideoOptions,
     WaitOptions,
-    check_folder,
 )
 from rfm_client.cli.show import (
     StreamedTable,
@@ -44,11 +41,9 @@ from rfm_client.cli.show import (
     status_tables,
     steps_with_server,
 )
-from rfm_client.cli.synthetic import BenchSamples, SyntheticSamples, are_frames, write_perf_analyzer_input
-from rfm_client.contract.addresses import split_url
+from rfm_client.cli.synthetic import SyntheticSamples, are_frames
 from rfm_client.contract.errors import DeadlineExceededError, RewardError
 from rfm_client.contract.results import FRAME_SCORES
-from rfm_client.contract.wire import frames_name
 from rfm_client.plot import save
 
 app = typer.Typer(
@@ -233,30 +228,6 @@ def sample(
         typer.echo(scores_table(f"{synthetic.sample_type} of random {of}", rows))
     output.write_json(documents.samples_document(server, synthetic.sample_type, outcomes))
     raise typer.Exit(exit_code_of(failures, some_succeeded=len(failures) < len(outcomes)))
-
-
-@app.command(cls=Command, epilog=EXIT_CODES)
-@with_options
-def bench_input(
-    output: Annotated[Path, typer.Option(help="JSON file to write.")],
-    synthetic: BenchSamples,
-    server: ServerOptions,
-) -> None:
-    """Write synthetic samples as input of Triton's perf_analyzer.
-
-    It prints a perf_analyzer command that sends them.
-
-    Example: rfm-client bench-input --output samples.json
-    """
-    with usage_errors("--output"):
-        check_folder("output", output.parent)
-    with server.connected() as client:
-        samples = synthetic.samples(client)
-    write_perf_analyzer_input(output, samples)
-    protocol, address = split_url(server.urls[0])
-    name = frames_name(server.model) if are_frames(samples) else server.model
-    words = ["perf_analyzer", "-m", name, "-i", protocol.removesuffix("s"), "-u", address, "--input-data", str(output)]
-    typer.echo(shlex.join([*words, "--async", "--concurrency-range", "1:16:5"]))
 
 
 def _report_subsampled(name: str, num_scored: int, num_frames: int) -> None:
