@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client import RewardClient, Sample
-from rfm_client.cli.synthetic import SampleType, SyntheticSamples
+from rfm_client.cli.options import SampleType, SyntheticSamples
 from rfm_client.contract.wire import DEFAULT_MODEL, encode_samples, frames_name
 
 

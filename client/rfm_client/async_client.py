@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast, overload
+from typing import TYPE_CHECKING, Literal, cast, overload
 
 from rfm_client.contract.checks import require
 from rfm_client.contract.description import ModelInfo
@@ -100,8 +100,8 @@ PREFIXES_AT_A_TIME = 64  # how many prefixes to hold in memory
 class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     """Client for one or several servers with the same checkpoint, in one event loop.
 
-    ``help(AsyncRewardClient.__init__)`` describes the options. Do not change a sample's arrays while you await the
-    call: a queued request reads them late.
+    ``help(RewardClient)`` describes the calls, ``help(AsyncRewardClient.__init__)`` the options. Do not change a
+    sample's arrays while you await the call: a queued request reads them late.
     """
 
     def __post_init__(self) -> None:
@@ -121,17 +121,13 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def progress(
         self, trajectory: Trajectory, *, frame_steps: int = 0, **options: Unpack[CallOptions]
     ) -> ProgressResult:
-        """Return progress and success at each frame; ``frame_steps`` as in ProgressSample. Raises RewardError."""
+        """As ``RewardClient.progress``."""
         return cast(ProgressResult, await self.score(ProgressSample(trajectory, frame_steps=frame_steps), **options))
 
     async def preference(
         self, first: Trajectory, second: Trajectory, *, both_orders: bool = False, **options: Unpack[CallOptions]
     ) -> PreferenceResult:
-        """Return the probability that ``first`` does the task better. Raises RewardError.
-
-        both_orders: True: also ask in the other order, since answers may depend on the order; ``preference`` is the
-            mean, and if the orders disagree, ``verdict`` is None. Recommended for labels
-        """
+        """As ``RewardClient.preference``."""
         sample = PreferenceSample(first, second)
         if not both_orders:
             return cast(PreferenceResult, await self.score(sample, **options))
@@ -142,21 +138,13 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def similarity(
         self, reference: Trajectory, other: Trajectory, **options: Unpack[CallOptions]
     ) -> SimilarityResult:
-        """Return a raw score for how similar ``other`` is to ``reference``. Raises RewardError."""
+        """As ``RewardClient.similarity``."""
         return cast(SimilarityResult, await self.score(SimilaritySample(reference, other), **options))
 
     async def curve(
         self, trajectory: Trajectory, sampling: Sampling | None = None, **options: Unpack[CallOptions]
     ) -> ProgressResult:
-        """Score every frame as if it were the newest: from that frame and the frames before it.
-
-        sampling: which frames the model sees from a prefix; None: as in the checkpoint's training
-        options: apply to each underlying call; several are needed because the prefixes of a long trajectory exceed
-            memory
-
-        Raises RewardError; ValueError if neither ``sampling`` nor the checkpoint gives a frame count, and for
-        ``subsample``.
-        """
+        """As ``RewardClient.curve``."""
         require("subsample", not options.get("subsample"), "False: the sampling rule chooses the frames", True)
         info = await self.model_info(frames=trajectory.frames is not None, timeout_s=options.get("timeout_s"))
         info.check_scores_prefixes()
@@ -176,7 +164,8 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
 
     async def score(self, sample: Sample, **options: Unpack[CallOptions]) -> Result:
         """Return the result of one sample of any type. Raises RewardError."""
-        return await self._scorer.result(sample, self._call(options))
+        (result,) = results_of(await self._scorer.outcomes([sample], self._call(options)))
+        return result
 
     @overload
     async def evaluate(
@@ -189,11 +178,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def evaluate(
         self, samples: Iterable[Sample], *, return_errors: bool = False, **options: Unpack[CallOptions]
     ) -> list[Result] | list[Result | RewardError]:
-        """Score samples in any number and mix; return results in order.
-
-        return_errors: True: return a failed sample's error in place of a result; False: raise the first error,
-            as ``samples[3].num_frames: expected X, got Y``
-        """
+        """As ``RewardClient.evaluate``."""
         samples = list(samples)
         outcomes = await self._scorer.outcomes(samples, self._call(options))
         return outcomes if return_errors else results_of(outcomes, "samples[{}]" if len(samples) > 1 else "")
@@ -210,10 +195,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def encode(
         self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None
     ) -> Trajectory:
-        """Return the trajectory with embeddings instead of frames, for repeated scoring. Raises RewardError.
-
-        The checkpoint must be served with encoders.
-        """
+        """As ``RewardClient.encode``."""
         return await self._scorer.embeddings(trajectory, self._call({"timeout_s": timeout_s, "request_id": request_id}))
 
     async def probe(self, model: ModelInfo, *, timeout_s: float | None = None) -> None:
@@ -221,12 +203,12 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         await self.progress(blank_trajectory(model.widths), timeout_s=timeout_s, request_id=PROBE_PREFIX)
 
     async def is_ready(self, *, timeout_s: float | None = None) -> bool:
-        """True if a server answers and has the model ready, for embeddings or for raw frames."""
+        """As ``RewardClient.is_ready``."""
         left_s = self._deadline(timeout_s).remaining_s()
         return await self._servers.is_ready((self.model, frames_name(self.model)), left_s)
 
     async def wait_ready(self, timeout_s: float) -> None:
-        """Wait until ``is_ready``. Raises DeadlineExceededError, or ServerUnavailableError for wrong ports."""
+        """As ``RewardClient.wait_ready``."""
         deadline = self._deadline(timeout_s)
         await self._servers.check_ports()
         while deadline.ends_within(0) or not await self.is_ready(
@@ -247,20 +229,12 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def model_info(
         self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None
     ) -> ModelInfo:
-        """Describe the model for embeddings or, with ``frames``, for raw frames.
-
-        refresh: True: ask the server again; False: reuse the description until another model version answers
-
-        Raises ModelNotFoundError if the model is not served.
-        """
+        """As ``RewardClient.model_info``."""
         name = frames_name(self.model) if frames else self.model
         return await self._scorer.model_info(name, self._deadline(timeout_s), refresh=refresh)
 
     async def model_infos(self, *, timeout_s: float | None = None) -> dict[Part, list[ModelInfo]]:
-        """Describe the checkpoint's served parts, as reported by every reachable server.
-
-        Raises RewardError if no server answers.
-        """
+        """As ``RewardClient.model_infos``."""
         deadline = self._deadline(timeout_s)
         infos: dict[Part, list[ModelInfo]] = {}
         for part, name in self.model_names.items():
@@ -288,8 +262,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
 
     def _call(self, options: CallOptions) -> Call:
         """Return a call that begins now. Raises TypeError for an unknown option."""
-        others: dict[str, Any] = {**options}
-        return Call(self._deadline(others.pop("timeout_s", None)), **others)
+        return Call(self._deadline(options.get("timeout_s")), options)
 
     def _deadline(self, timeout_s: float | None) -> Deadline:
         """Return the deadline for a call that begins now. timeout_s: None: the client's."""

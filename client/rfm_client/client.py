@@ -52,14 +52,23 @@ class RewardClient(ClientOptions, Closing, OneProcess):
     ) -> PreferenceResult:
         """Return the probability that ``first`` does the task better. Raises RewardError.
 
-        both_orders: as in AsyncRewardClient
+        both_orders: True: also ask in the other order, since answers may depend on the order; ``preference`` is the
+            mean, and if the orders disagree, ``verdict`` is None. Recommended for labels
         """
         return self._loop.wait(self._client.preference(first, second, both_orders=both_orders, **options))
 
     def curve(
         self, trajectory: Trajectory, sampling: Sampling | None = None, **options: Unpack[CallOptions]
     ) -> ProgressResult:
-        """Score every frame from the frames up to it, as AsyncRewardClient.curve does. Raises RewardError."""
+        """Score every frame as if it were the newest: from that frame and the frames before it.
+
+        sampling: which frames the model sees from a prefix; None: as in the checkpoint's training
+        options: apply to each underlying call; several are needed because the prefixes of a long trajectory exceed
+            memory
+
+        Raises RewardError; ValueError if neither ``sampling`` nor the checkpoint gives a frame count, and for
+        ``subsample``.
+        """
         return self._loop.wait(self._client.curve(trajectory, sampling, **options))
 
     def similarity(self, reference: Trajectory, other: Trajectory, **options: Unpack[CallOptions]) -> SimilarityResult:
@@ -79,7 +88,8 @@ class RewardClient(ClientOptions, Closing, OneProcess):
     ) -> list[Result] | list[Result | RewardError]:
         """Score samples in any number and mix; return results in order.
 
-        return_errors: True: return a RewardError in place of a failed result; False: raise the first error
+        return_errors: True: return a failed sample's error in place of a result; False: raise the first error,
+            as ``samples[3].num_frames: expected X, got Y``
         """
         samples = list(samples)  # in this thread: an iterator may be slow, or call this client
         return self._loop.wait(self._client.evaluate(samples, return_errors=return_errors, **options))

@@ -206,7 +206,7 @@ def test_exit_codes_are_documented_with_every_command() -> None:
     for code in ExitCode:
         assert re.search(rf"\b{code.value} ", exit_codes), code
     commands = get_command(rfm_client_app).commands  # type: ignore[attr-defined]
-    assert len(commands) == 9
+    assert len(commands) == 8
     for name in commands:
         assert exit_codes in " ".join(invoke(name, "--help").stdout.split())
 

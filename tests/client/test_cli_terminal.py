@@ -22,9 +22,9 @@ from engine_server import EngineServer
 from paths import ROOT
 from rfm_client import FrameScores, PreferenceSample, ProgressResult, ProgressSample, Sample
 from rfm_client.cli.documents import frame_document
+from rfm_client.cli.options import SyntheticSamples
 from rfm_client.cli.scoring import unique_stems
 from rfm_client.cli.show import shortened, status_tables
-from rfm_client.cli.synthetic import SyntheticSamples
 from rfm_client.command_line import ExitCode, number
 from rfm_client.contract.wire import encode_samples
 from rfm_client.serving import ServerStatus
@@ -54,14 +54,11 @@ def shown(url: str, *asked: object, code: ExitCode = ExitCode.OK) -> tuple[set[s
     return {*result.stdout.split()}, result.stdout
 
 
-def test_status_fits_a_terminal_and_ends_with_commands_to_try_next(demo_server: Endpoints) -> None:
+def test_status_fits_a_terminal(demo_server: Endpoints) -> None:
     url = demo_server.grpc_url
-    words, told = shown(url, "status", "--metrics-url", demo_server.metrics_url)
+    words, _ = shown(url, "status", "--metrics-url", demo_server.metrics_url)
     heads = {"model", "v", "state", "requests", "failed", "refused", "pending", "batches", "samples", "queue", "ms"}
     assert heads | {"rfm", "rfm_encoder", "rfm_frames"} <= words
-    assert f"rfm-client score VIDEO --task TASK --url {url}" in told
-    assert f"rfm-client gateway --port 8100 --triton {url}" in told
-    assert "http://localhost:8100/" in told
 
 
 def test_scores_and_comparisons_fit_a_terminal_and_name_each_file(engines: EngineServer, videos: list[Path]) -> None:
@@ -162,7 +159,7 @@ def test_a_score_that_is_not_predicted_is_null_in_json_and_shown_as_a_dash() -> 
     assert [number(value) for value in (None, float("nan"), 0.5)] == ["-", "-", "0.5000"]
 
 
-def test_files_about_videos_of_one_name_do_not_overwrite_each_other() -> None:
+def test_videos_of_one_name_are_told_apart() -> None:
     names = ["a/clip.mp4", "b/clip.mp4", "http://host/clip.mp4?size=2", "other.tar.mp4"]
-    assert unique_stems(names) == ["clip", "clip_2", "clip_3", "other.tar"]
-    assert unique_stems(["x/a.mp4", "a_2.mp4", "y/a.mp4"]) == ["a", "a_2", "a_3"]
+    assert unique_stems(names) == ["1_clip", "2_clip", "3_clip", "4_other.tar"]
+    assert unique_stems(names[1:2] + names[3:]) == ["clip", "other.tar"]

@@ -83,9 +83,7 @@ USAGE = {
     ),
     "rfm-client compare a.mp4": "Missing argument 'SECOND'.",
     "rfm-client sample --num-frames 8-4": bad("--num-frames", "expected a whole number, got '8-4'"),
-    "rfm-client --task x score a.mp4": (
-        "No such option: --task: it stands after the command, as in rfm-client score --task"
-    ),
+    "rfm-client --task x score a.mp4": "No such option: --task",
     "rfm-client serve my_models": "No such command 'serve': that is `rfm serve`",
     f"rfm-client gateway --triton {NOBODY} --metrics-url nope": bad(
         "--metrics-url", "expected http://host:port/metrics, got 'nope'"

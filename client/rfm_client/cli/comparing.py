@@ -8,11 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import PurePath
 from typing import cast
 
 from rfm_client.cli.options import VideoOptions
-from rfm_client.cli.pictures import Panel
 from rfm_client.cli.scoring import Source
 from rfm_client.cli.show import at_end, number, table
 from rfm_client.client import RewardClient
@@ -52,13 +50,6 @@ class Comparison:
         told = NO_VERDICT if verdict is None else f"The {verdict} video does the task better."
         asked, swapped = map(number, self.preference.both_orders or ())
         return f"{table('', columns, rows)}\nP(first wins) = {asked}, with the order swapped {swapped}.\n{told}"
-
-    def panels(self) -> list[Panel]:
-        """Return a plot panel for each source."""
-        return [
-            source.panel(f"{PurePath(source.name).name}: wins with P = {wins:.3f}", scores)
-            for source, scores, wins in zip(self.sources, self.scores, self.wins, strict=True)
-        ]
 
 
 def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> Comparison:

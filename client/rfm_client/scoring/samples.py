@@ -7,10 +7,10 @@ import asyncio
 import itertools
 import logging
 import secrets
-from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from copy import copy
 from functools import partial
-from typing import Any, TypeAlias, TypedDict, TypeVar, cast
+from typing import TypeAlias, TypedDict, cast
 
 from rfm_client.contract import wire
 from rfm_client.contract.description import ModelInfo
@@ -61,7 +61,7 @@ class CallOptions(TypedDict, total=False):
 
 
 class Call:
-    """Values shared by all requests in one call. Raises ValueError for an invalid request id.
+    """Values shared by all requests in one call. Raises ValueError for an invalid request id, TypeError for others.
 
     outputs: names of outputs to request
     request_ids: yields an id for each request
@@ -72,26 +72,21 @@ class Call:
     server: int | None = None
     checks_blank = True
 
-    def __init__(
-        self,
-        deadline: Deadline,
-        *,
-        logits: bool = False,
-        log_prob: bool = False,
-        all_scores: bool = False,
-        timing: bool = False,
-        subsample: bool = False,
-        resize: bool = False,
-        request_id: str | None = None,
-    ) -> None:
+    def __init__(self, deadline: Deadline, options: CallOptions) -> None:
+        if unknown := options.keys() - CallOptions.__annotations__.keys():
+            raise TypeError(
+                f"expected options among {', '.join(CallOptions.__annotations__)}, got {', '.join(unknown)}"
+            )
+        request_id = options.get("request_id")
         if request_id is not None and not wire.REQUEST_ID.fullmatch(request_id):
             raise InvalidValueError.at("request_id", "1 to 64 letters, digits or any of ._:/+=@-", repr(request_id))
         prefix = request_id or secrets.token_hex(_ID_BYTES)
         self.deadline = deadline
         self.request_ids = (f"{prefix}-{number}" for number in itertools.count(1))
-        options = {wire.PROGRESS_LOGITS: logits, "log_prob": log_prob, wire.TIMING_MS: timing}
-        self.outputs = tuple(name for name, is_asked in options.items() if is_asked)
-        self.all_scores, self.subsample, self.resize = all_scores, subsample, resize
+        outputs = {wire.PROGRESS_LOGITS: "logits", "log_prob": "log_prob", wire.TIMING_MS: "timing"}
+        self.outputs = tuple(output for output, option in outputs.items() if options.get(option))
+        self.all_scores = options.get("all_scores", False)
+        self.subsample, self.resize = options.get("subsample", False), options.get("resize", False)
 
     def at(self, server: int) -> Call:
         """Return a copy of the call that asks this server first."""
@@ -100,7 +95,6 @@ class Call:
         return call
 
 
-Answered = TypeVar("Answered")
 Outcome: TypeAlias = Result | RewardError
 
 logger = logging.getLogger("rfm_client")
@@ -124,13 +118,6 @@ class SampleScorer:
         self._checks_blank = True  # until a video was blank
         self._asking = asyncio.Lock()
 
-    async def result(self, sample: Sample, call: Call) -> Result:
-        """Return the result of one sample. Raises RewardError."""
-        fit = await self._fitted(sample, call)
-        (result,) = results_of(list(await self._request(model_of(fit.sample, self._model), [fit.sample], call)))
-        await self._check_lengths([fit.sample], call.deadline)
-        return with_frame_indices(result, fit.frame_indices)
-
     async def outcomes(self, samples: Sequence[Sample], call: Call) -> list[Outcome]:
         """Return a result or error for each sample. Errors carry no traceback, which would keep arrays alive."""
         fits: dict[int, FittedSample] = {}
@@ -141,7 +128,7 @@ class SampleScorer:
             except RewardError as error:
                 outcomes[index] = error.with_traceback(None)
         sent = {index: fit.sample for index, fit in fits.items()}
-        scored = await _together([self._scored(*group, sent, call) for group in groups(sent, self._model)])
+        scored = await asyncio.gather(*(self._scored(*group, sent, call) for group in groups(sent, self._model)))
         for index, outcome in itertools.chain(*scored):
             indices = fits[index].frame_indices
             outcomes[index] = outcome if isinstance(outcome, RewardError) else with_frame_indices(outcome, indices)
@@ -231,7 +218,7 @@ class SampleScorer:
         except RewardError as error:
             return zip(group, for_each(error, len(group)), strict=True)
         requests = [[samples[index] for index in part] for part in parts(samples, group, limit)]
-        answered = await _together([self._request(model, request, call) for request in requests])
+        answered = await asyncio.gather(*(self._request(model, request, call) for request in requests))
         return zip(group, itertools.chain(*answered), strict=True)
 
     async def _request(
@@ -301,11 +288,6 @@ def _longest(sample: Sample) -> int:
     if isinstance(sample, ProgressSample) and sample.frame_steps:
         return 0
     return max(trajectory.num_frames for trajectory in sample.trajectories)
-
-
-async def _together(calls: Sequence[Coroutine[Any, Any, Answered]]) -> Sequence[Answered]:
-    """Await all coroutines. A single coroutine, as in most calls, needs no separate task."""
-    return [await calls[0]] if len(calls) == 1 else await asyncio.gather(*calls)
 
 
 def results_of(outcomes: list[Outcome], where: str = "") -> list[Result]:
