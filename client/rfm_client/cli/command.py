@@ -14,9 +14,10 @@ from typing import Annotated, Any, ClassVar, Generic, TypeVar, get_args, get_ori
 
 import typer
 from typer.core import TyperCommand, TyperGroup
+from typer.models import OptionInfo
 
 from rfm_client.contract import errors
-from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts
+from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, placeholder_of
 from rfm_client.contract.triton import FEWER_FRAMES
 
 STANDARD_OUTPUT = "-"
@@ -68,6 +69,7 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
         if each.name in options:
             parameters += map(_parameter, options[each.name])
         else:
+            _set_placeholder(each.annotation)
             parameters.append(each.replace(kind=inspect.Parameter.KEYWORD_ONLY))
     are_given = {each.name for each in own if get_origin(each.annotation) is OptionValues}
 
@@ -264,6 +266,13 @@ def _given(options: Sequence[Setting], values: dict[str, Any]) -> OptionValues[A
             value = each.parse(value) if each.parse else value
         given[each.name] = tuple(value) if isinstance(value, list) else value
     return given
+
+
+def _set_placeholder(hint: Any) -> None:
+    """Give an option its placeholder, unless it has one."""
+    for mark in get_args(hint)[1:]:
+        if isinstance(mark, OptionInfo) and mark.metavar is None:
+            mark.metavar = placeholder_of(get_args(hint)[0])
 
 
 def _shown(default: Any) -> str:

@@ -63,7 +63,8 @@ def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> 
     second = replace(second, task=first.task, text_embedding=first.text_embedding)
     options: CallOptions = {"subsample": video.subsample, "resize": video.resize}
     preference = client.preference(first, second, both_orders=True, **options)
-    alone = client.evaluate([ProgressSample(first), ProgressSample(second)], all_scores=True, **options)
+    options["all_scores"] = True
+    alone = client.evaluate([ProgressSample(first), ProgressSample(second)], **options)
     versions = sorted({str(result.model_version) for result in (preference, *alone)})
     if len(versions) > 1:
         raise InferenceFailedError(f"model_version: expected one for all videos, got {', '.join(versions)}: ask again")

@@ -82,11 +82,8 @@ def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, colum
 
     columns: panels side by side
     """
-    try:
-        import matplotlib.style
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError('plots need matplotlib: pip install "./client[cli]"') from error
+    import matplotlib.style
+    from matplotlib.figure import Figure
 
     panel_in = WIDTH_IN if columns == 1 else COLUMN_WIDTH_IN
     width_in, curves_in = panel_in * columns, panel_in - _LEFT - _RIGHT

@@ -163,8 +163,7 @@ class SourceScorer:
                 error.source = ""
             return Failed(name, error, user_message(error), is_server_gone=self._is_server_gone(error))
         if self.recording is not None:
-            frames = source.trajectory.frames
-            self.recording.add((stem,), result, {} if frames is None else {"": frames}, source.times_s)
+            self.recording.add(stem, result, source.trajectory.frames, source.times_s)
         return Scored(
             name=name,
             checkpoint=checkpoint,

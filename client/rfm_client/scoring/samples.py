@@ -29,7 +29,7 @@ from rfm_client.frames.fit_to_checkpoint import FittedSample, fitted, whole, wit
 from rfm_client.scoring.batching import groups, model_of, padded_bytes, parts
 from rfm_client.transport.calls import Answer
 from rfm_client.transport.limits import ConcurrencyLimiter, Deadline
-from rfm_client.transport.servers import PROBE_TIMEOUT_S, Servers
+from rfm_client.transport.servers import Servers
 from rfm_client.transport.threads import off_loop
 
 _ID_BYTES = 8  # random bytes in a call's request ids
@@ -116,7 +116,6 @@ class SampleScorer:
         self._infos: dict[str, ModelInfo] = {}  # until another model version answers
         self._checks_lengths = True  # until a trajectory was too long
         self._checks_blank = True  # until a video was blank
-        self._asking = asyncio.Lock()
 
     async def outcomes(self, samples: Sequence[Sample], call: Call) -> list[Outcome]:
         """Return a result or error for each sample. Errors carry no traceback, which would keep arrays alive."""
@@ -133,7 +132,7 @@ class SampleScorer:
             indices = fits[index].frame_indices
             outcomes[index] = outcome if isinstance(outcome, RewardError) else with_frame_indices(outcome, indices)
         answered = [sample for index, sample in sent.items() if not isinstance(outcomes[index], RewardError)]
-        await self._check_lengths(answered, call.deadline)
+        self._check_lengths(answered)
         return [outcomes[index] for index in range(len(samples))]
 
     async def embeddings(self, trajectory: Trajectory, call: Call) -> Trajectory:
@@ -173,25 +172,12 @@ class SampleScorer:
             expected = "frames: expected pictures that show something, got %d frames: %s (logged once)"
             logger.warning(expected, len(frames), BlankFrames(frames).told)
 
-    async def _check_lengths(self, samples: Sequence[Sample], deadline: Deadline) -> None:
-        """Warn about samples that are too long. An unknown limit costs one query to the server."""
-        lengths: dict[str, int] = {}
+    def _check_lengths(self, samples: Iterable[Sample]) -> None:
+        """Log the first sample that is too long, if its model is described."""
         for sample in samples if self._checks_lengths else ():
-            model = model_of(sample, self._model)
-            lengths[model] = max(lengths.get(model, 1), _longest(sample))
-        for model, num_frames in lengths.items():
-            info = None if num_frames == 1 else self._infos.get(model) or await self._limits(model, deadline)
+            info = self._infos.get(model_of(sample, self._model))
             if info is not None:
-                self.tell_of_length(num_frames, info)
-
-    async def _limits(self, model: str, deadline: Deadline) -> ModelInfo | None:
-        """Return the model's description; None on failure: with the answer already here, the call must not fail."""
-        async with self._asking:
-            try:
-                return await self.model_info(model, Deadline(min(PROBE_TIMEOUT_S, deadline.remaining_s())))
-            except RewardError:
-                self._checks_lengths = False  # otherwise every call would ask again
-                return None
+                self.tell_of_length(_longest(sample), info)
 
     async def _fitted(self, sample: Sample, call: Call) -> FittedSample:
         """Return the sample as the call sends it. Raises RewardError."""
@@ -233,7 +219,7 @@ class SampleScorer:
         asked: tuple[str, ...] = (*wire.outputs_for(samples), *call.outputs)
         more: list[str] = []
         try:
-            given = await self._given(model, samples, call) if asks_given else ()
+            given = await self._given(model, call) if asks_given else ()
             more = [name for name in wire.outputs_for(samples, given, all_scores=call.all_scores) if name not in asked]
             answer = await self.infer(model, size, tensors, (*asked, *more), call, request_id)
             return wire.decode_results(answer.tensors, samples, answer.model_version)
@@ -249,10 +235,8 @@ class SampleScorer:
         alone = await asyncio.gather(*(self._request(model, [sample], call) for sample in samples))
         return [outcome for (outcome,) in alone]
 
-    async def _given(self, model: str, samples: Sequence[Sample], call: Call) -> tuple[str, ...]:
+    async def _given(self, model: str, call: Call) -> tuple[str, ...]:
         """Return the names of all scores in the model's description. Raises RewardError."""
-        if samples[0].trajectories[0].frames is None and not call.all_scores:
-            return ()  # the description would cost a request, and embedding models give no more unasked
         try:
             return (await self.model_info(model, call.deadline)).scores
         except (ModelNotFoundError, InferenceFailedError):  # the request itself decides
