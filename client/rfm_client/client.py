@@ -11,13 +11,13 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 from rfm_client.async_client import AsyncRewardClient, ClientOptions
-from rfm_client.contract.checks import checked_count, require
+from rfm_client.contract.checks import checked_count
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.contract.wire import Part
-from rfm_client.episodes.episodes import Episode, Episodes
+from rfm_client.episodes.episodes import Episode
 from rfm_client.episodes.options import EpisodeOptions, StepKeywords, StepScore
 from rfm_client.episodes.steps import Steps
 from rfm_client.frames.fit_to_checkpoint import snapshot
@@ -117,18 +117,7 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         options: EpisodeOptions fields. Raises ValueError for contradictory options
         """
         where = "" if env is None else f"envs[{checked_count('env', env, least=0)}]"
-        return Episode(self._episodes([Steps(task, EpisodeOptions(**options), where)]))
-
-    def episodes(self, num: int, task: str | Sequence[str], **options: Unpack[StepKeywords]) -> Episodes:
-        """Return ``num`` parallel episodes, as in vectorised environments. A step sends as few requests as possible.
-
-        task: one sentence for all episodes, or one per episode
-        options: as in ``episode``
-        """
-        tasks = [task] * num if isinstance(task, str) else list(task)
-        require("task", len(tasks) == num, f"one for each of {num} episodes", len(tasks))
-        each, where = EpisodeOptions(**options), "episodes[{}]" if num > 1 else ""
-        return self._episodes([Steps(sentence, each, where.format(env)) for env, sentence in enumerate(tasks)])
+        return Episode(self._client, self._loop, self, Steps(task, EpisodeOptions(**options), where))
 
     def score_episodes(self, episodes: Sequence[Episode]) -> list[StepScore]:
         """Score all episodes at their newest frames, with as few requests as possible. Raises RewardError.
@@ -180,9 +169,6 @@ class RewardClient(ClientOptions, Closing, OneProcess):
     def close(self) -> None:
         """End running calls, which raise ClientClosedError, close the connections and release shared memory."""
         self._finalizer()
-
-    def _episodes(self, steps: list[Steps]) -> Episodes:
-        return Episodes(self._client, self._loop, self, steps)
 
 
 def _close(client: AsyncRewardClient, loop: LoopThread) -> None:

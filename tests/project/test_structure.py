@@ -255,9 +255,8 @@ def test_a_package_exports_all_that_it_imports_for_its_users(package: str) -> No
 def test_the_keywords_of_an_episode_are_its_options() -> None:
     """A TypedDict cannot be derived from a dataclass."""
     options = get_type_hints(EpisodeOptions)
-    for method in (RewardClient.episode, RewardClient.episodes):
-        (keywords,) = get_args(get_type_hints(method, localns={"Unpack": Unpack})["options"])
-        assert get_type_hints(keywords) == {field.name: options[field.name] for field in fields(EpisodeOptions)}
+    (keywords,) = get_args(get_type_hints(RewardClient.episode, localns={"Unpack": Unpack})["options"])
+    assert get_type_hints(keywords) == {field.name: options[field.name] for field in fields(EpisodeOptions)}
 
 
 @pytest.mark.parametrize(
