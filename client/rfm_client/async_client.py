@@ -121,13 +121,13 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def progress(
         self, trajectory: Trajectory, *, frame_steps: int = 0, **options: Unpack[CallOptions]
     ) -> ProgressResult:
-        """As ``RewardClient.progress``."""
+        """Return progress and success at each frame, as ``RewardClient.progress`` does."""
         return cast(ProgressResult, await self.score(ProgressSample(trajectory, frame_steps=frame_steps), **options))
 
     async def preference(
         self, first: Trajectory, second: Trajectory, *, both_orders: bool = False, **options: Unpack[CallOptions]
     ) -> PreferenceResult:
-        """As ``RewardClient.preference``."""
+        """Return the probability that ``first`` does the task better, as ``RewardClient.preference`` does."""
         sample = PreferenceSample(first, second)
         if not both_orders:
             return cast(PreferenceResult, await self.score(sample, **options))
@@ -138,13 +138,13 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def similarity(
         self, reference: Trajectory, other: Trajectory, **options: Unpack[CallOptions]
     ) -> SimilarityResult:
-        """As ``RewardClient.similarity``."""
+        """Return how similar ``other`` is to ``reference``, as ``RewardClient.similarity`` does."""
         return cast(SimilarityResult, await self.score(SimilaritySample(reference, other), **options))
 
     async def curve(
         self, trajectory: Trajectory, sampling: Sampling | None = None, **options: Unpack[CallOptions]
     ) -> ProgressResult:
-        """As ``RewardClient.curve``."""
+        """Score every frame as if it were the newest, as ``RewardClient.curve`` does."""
         require("subsample", not options.get("subsample"), "False: the sampling rule chooses the frames", True)
         info = await self.model_info(frames=trajectory.frames is not None, timeout_s=options.get("timeout_s"))
         info.check_scores_prefixes()
@@ -178,14 +178,12 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def evaluate(
         self, samples: Iterable[Sample], *, return_errors: bool = False, **options: Unpack[CallOptions]
     ) -> list[Result] | list[Result | RewardError]:
-        """As ``RewardClient.evaluate``."""
+        """Return results for samples in any number and mix, as ``RewardClient.evaluate`` does."""
         samples = list(samples)
         outcomes = await self._scorer.outcomes(samples, self._call(options))
         return outcomes if return_errors else results_of(outcomes, "samples[{}]" if len(samples) > 1 else "")
 
-    async def score_steps(
-        self, asked: Sequence[Asked], asked_s: float, *, timeout_s: float | None = None
-    ) -> list[StepScore]:
+    async def score_steps(self, asked: Sequence[Asked], asked_s: float, timeout_s: float | None) -> list[StepScore]:
         """Score episodes at the steps asked for, with as few requests as possible. Raises RewardError.
 
         asked_s: when the caller began to wait, by ``time.perf_counter``
@@ -195,7 +193,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def encode(
         self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None
     ) -> Trajectory:
-        """As ``RewardClient.encode``."""
+        """Return the trajectory with embeddings instead of frames, as ``RewardClient.encode`` does."""
         return await self._scorer.embeddings(trajectory, self._call({"timeout_s": timeout_s, "request_id": request_id}))
 
     async def probe(self, model: ModelInfo, *, timeout_s: float | None = None) -> None:
@@ -203,12 +201,12 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         await self.progress(blank_trajectory(model.widths), timeout_s=timeout_s, request_id=PROBE_PREFIX)
 
     async def is_ready(self, *, timeout_s: float | None = None) -> bool:
-        """As ``RewardClient.is_ready``."""
+        """True if a server has the model ready, as in ``RewardClient.is_ready``."""
         left_s = self._deadline(timeout_s).remaining_s()
         return await self._servers.is_ready((self.model, frames_name(self.model)), left_s)
 
     async def wait_ready(self, timeout_s: float) -> None:
-        """As ``RewardClient.wait_ready``."""
+        """Wait until a server has the model ready, as ``RewardClient.wait_ready`` does."""
         deadline = self._deadline(timeout_s)
         await self._servers.check_ports()
         while deadline.ends_within(0) or not await self.is_ready(
@@ -229,12 +227,12 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def model_info(
         self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None
     ) -> ModelInfo:
-        """As ``RewardClient.model_info``."""
+        """Describe the model, as ``RewardClient.model_info`` does."""
         name = frames_name(self.model) if frames else self.model
         return await self._scorer.model_info(name, self._deadline(timeout_s), refresh=refresh)
 
     async def model_infos(self, *, timeout_s: float | None = None) -> dict[Part, list[ModelInfo]]:
-        """As ``RewardClient.model_infos``."""
+        """Describe the checkpoint's served parts, as ``RewardClient.model_infos`` does."""
         deadline = self._deadline(timeout_s)
         infos: dict[Part, list[ModelInfo]] = {}
         for part, name in self.model_names.items():

@@ -19,6 +19,7 @@ from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample
 from rfm_client.contract.wire import Part
 from rfm_client.episodes.episodes import Episode
 from rfm_client.episodes.options import EpisodeOptions, StepKeywords, StepScore
+from rfm_client.episodes.scorer import Asked
 from rfm_client.episodes.steps import Steps
 from rfm_client.frames.fit_to_checkpoint import snapshot
 from rfm_client.frames.sampling import Sampling
@@ -117,19 +118,19 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         options: EpisodeOptions fields. Raises ValueError for contradictory options
         """
         where = "" if env is None else f"envs[{checked_count('env', env, least=0)}]"
-        return Episode(self._client, self._loop, self, Steps(task, EpisodeOptions(**options), where))
+        return Episode(Steps(task, EpisodeOptions(**options), where), self._score_steps, self.model_info)
 
     def score_episodes(self, episodes: Sequence[Episode]) -> list[StepScore]:
         """Score all episodes at their newest frames, with as few requests as possible. Raises RewardError.
 
         Frames come from ``Episode.keep``, and stay in the episodes after a failure.
         """
-        return self._loop.wait(self._client.score_steps([each.asked for each in episodes], time.perf_counter()))
+        return self._score_steps([each.asked for each in episodes], time.perf_counter(), None)
 
     def submit_episodes(self, episodes: Sequence[Episode]) -> Future[list[StepScore]]:
         """Start ``score_episodes`` and return a future at once. Frames kept later do not change the scores."""
         asked = [each.asked for each in episodes]
-        future = self._loop.start(self._client.score_steps(asked, time.perf_counter()))
+        future = self._loop.start(self._client.score_steps(asked, time.perf_counter(), None))
         future.add_done_callback(lambda _done: self)
         return future
 
@@ -169,6 +170,9 @@ class RewardClient(ClientOptions, Closing, OneProcess):
     def close(self) -> None:
         """End running calls, which raise ClientClosedError, close the connections and release shared memory."""
         self._finalizer()
+
+    def _score_steps(self, asked: Sequence[Asked], asked_s: float, timeout_s: float | None) -> list[StepScore]:
+        return self._loop.wait(self._client.score_steps(asked, asked_s, timeout_s))
 
 
 def _close(client: AsyncRewardClient, loop: LoopThread) -> None:

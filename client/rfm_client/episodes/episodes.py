@@ -5,16 +5,14 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any
 
-from rfm_client.contract.description import FrameSize
+from rfm_client.contract.description import FrameSize, ModelInfo
 from rfm_client.episodes.options import StepScore
 from rfm_client.episodes.scorer import Asked
 from rfm_client.episodes.steps import Steps
-from rfm_client.transport.threads import Closing, LoopThread, OneProcess
-
-if TYPE_CHECKING:
-    from rfm_client.async_client import AsyncRewardClient
+from rfm_client.transport.threads import Closing, OneProcess
 
 
 class Episode(Closing, OneProcess):
@@ -22,12 +20,17 @@ class Episode(Closing, OneProcess):
 
     It keeps all frames until it ends, because later steps show them again.
 
-    loop: runs ``client``
-    owner: stays alive as long as the episode
+    score: scores steps; gets when the caller began to wait, by ``time.perf_counter``, and a time limit
+    model_info: describes the model
     """
 
-    def __init__(self, client: AsyncRewardClient, loop: LoopThread, owner: object, steps: Steps) -> None:
-        self._client, self._loop, self._owner = client, loop, owner
+    def __init__(
+        self,
+        steps: Steps,
+        score: Callable[[Sequence[Asked], float, float | None], list[StepScore]],
+        model_info: Callable[..., ModelInfo],
+    ) -> None:
+        self._score, self._model_info = score, model_info
         self._steps = steps
         self._size: FrameSize | None = None  # frames shrink to this size
         self._adding = threading.Lock()
@@ -64,8 +67,8 @@ class Episode(Closing, OneProcess):
             steps, new = self._steps, self._steps.checked(frame, self._size)
             steps.frames.append(new)
             try:
-                scores = self._client.score_steps([self.asked], asked_s, timeout_s=steps.options.timeout_s)
-                return self._loop.wait(scores)[0]
+                (score,) = self._score([self.asked], asked_s, steps.options.timeout_s)
+                return score
             except BaseException:
                 steps.frames.remove(new)
                 raise
@@ -83,4 +86,4 @@ class Episode(Closing, OneProcess):
         options = self._steps.options
         if not options.resize:
             return None
-        return self._loop.wait(self._client.model_info(frames=True, timeout_s=options.timeout_s)).frame_size
+        return self._model_info(frames=True, timeout_s=options.timeout_s).frame_size
