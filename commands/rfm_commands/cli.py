@@ -217,7 +217,7 @@ try:
 
     app.command(cls=RfmCommand)(label)
 except ModuleNotFoundError as error:
-    RfmCommands.elsewhere["label"] = f"{error}: {RfmCommands.elsewhere['label']}"
+    RfmCommands.missing["label"] = f"{error}: {RfmCommands.missing['label']}"
 app.command("try", cls=RfmCommand)(try_video)
 app.add_typer(models_app, name="models")
 

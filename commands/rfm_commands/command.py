@@ -31,13 +31,9 @@ class RfmCommand(command.Command):
 class RfmCommands(command.Commands):
     """Command group for ``rfm``, which refers to ``rfm-client`` for commands that exist only there."""
 
-    elsewhere: ClassVar[dict[str, str]] = {
-        **{
-            name: f"that is `rfm-client {name}`"
-            for name in ("score", "compare", "status", "wait", "sample", "evaluate")
-        },
-        "label": "it needs rfm-labels: pip install ./client ./apps/labels .",
-    }
+    program, other_program = "rfm", "rfm-client"
+    elsewhere = ("score", "compare", "status", "wait", "sample", "evaluate")
+    missing: ClassVar[dict[str, str]] = {"label": "pip install ./client ./apps/labels ."}
 
 
 def say(line: str) -> None:

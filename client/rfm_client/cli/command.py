@@ -6,7 +6,7 @@ from __future__ import annotations
 import functools
 import inspect
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING
 from enum import IntEnum
@@ -153,18 +153,27 @@ class CommandGroup(TyperGroup):
 
 
 class Commands(CommandGroup):
-    """The ``rfm-client`` commands. elsewhere: for a command that is not here, how to run or install it."""
+    """The ``rfm-client`` commands.
 
-    elsewhere: ClassVar[dict[str, str]] = {
-        **{name: f"that is `rfm {name}`" for name in ("export", "serve", "try", "models")},
-        **dict.fromkeys(("evaluate", "label"), "it needs rfm-labels: pip install ./client ./apps/labels"),
-        "gateway": "it needs rfm-gateway: pip install ./client ./apps/gateway",
+    elsewhere: commands of the other program
+    missing: by command of an application that is not installed, how to install it
+    """
+
+    program, other_program = "rfm-client", "rfm"
+    elsewhere: Collection[str] = ("export", "serve", "try", "models")
+    missing: ClassVar[dict[str, str]] = {
+        **dict.fromkeys(("evaluate", "label"), "pip install ./client ./apps/labels"),
+        "gateway": "pip install ./client ./apps/gateway",
     }
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command. Raises a usage error that says where the command is."""
-        if args[0] in self.elsewhere and self.get_command(ctx, args[0]) is None:
-            ctx.fail(f"No such command '{args[0]}': {self.elsewhere[args[0]]}")
+        """Find the command. Raises a usage error that names the right program, typer.Exit if a package is missing."""
+        name = args[0]
+        if self.get_command(ctx, name) is None and name in self.elsewhere:
+            ctx.fail(f"No such command '{name}': that is `{self.other_program} {name}`")
+        if self.get_command(ctx, name) is None and name in self.missing:
+            report(f"{name}: expected its package, got none: {self.missing[name]}", self.program)
+            raise typer.Exit(ExitCode.FAILED)
         return super().resolve_command(ctx, args)
 
 

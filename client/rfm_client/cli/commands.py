@@ -235,7 +235,7 @@ def _add_applications() -> None:
         try:
             app.command(found.name, cls=Command, epilog=EXIT_CODES)(found.load())
         except ImportError as error:
-            Commands.elsewhere[found.name] = str(error)
+            Commands.missing[found.name] = f"{error}: {Commands.missing.get(found.name, found.value)}"
 
 
 _add_applications()
