@@ -28,7 +28,6 @@ THRESHOLD: dict[str, Any] = {
     "linewidth": 0.9,
     "zorder": 1,
 }  # the line above which success counts
-FAINT = "#4d5761"  # for less important text
 GRID: dict[str, Any] = {"color": "#dde2e6", "linewidth": 0.5, "zorder": 0}
 BOUNDS = (-0.03, 1.03)  # limits for an axis from 0 to 1
 

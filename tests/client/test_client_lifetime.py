@@ -75,8 +75,6 @@ HOLDERS: dict[str, Callable[[RewardClient], Any]] = {
     "RewardClient": lambda client: client,
     "AsyncRewardClient": lambda client: AsyncRewardClient(NOBODY),
     "Episode": lambda client: client.episode("lift"),
-    "Episodes": lambda client: client.episodes(2, "lift"),
-    "AsyncEpisode": lambda client: AsyncRewardClient(NOBODY).episode("lift"),
     "RewardModelWrapper": lambda client: RewardModelWrapper(
         gymnasium.make("CartPole-v1", render_mode="rgb_array"), client, "lift"
     ),

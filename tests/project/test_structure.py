@@ -18,7 +18,7 @@ import pytest
 from typing_extensions import Unpack
 
 from paths import ROOT
-from rfm_client import AsyncRewardClient, RewardClient
+from rfm_client import RewardClient
 from rfm_client.episodes import EpisodeOptions
 
 SHARED = {"rfm.config", "rfm.engine", "rfm.files", "rfm.saved", "rfm.weights", "rfm_client.contract"}
@@ -258,9 +258,8 @@ def test_a_package_exports_all_that_it_imports_for_its_users(package: str) -> No
 def test_the_keywords_of_an_episode_are_its_options() -> None:
     """A TypedDict cannot be derived from a dataclass."""
     options = get_type_hints(EpisodeOptions)
-    for method in (RewardClient.episode, RewardClient.episodes, AsyncRewardClient.episode, AsyncRewardClient.episodes):
-        (keywords,) = get_args(get_type_hints(method, localns={"Unpack": Unpack})["options"])
-        assert get_type_hints(keywords) == {field.name: options[field.name] for field in fields(EpisodeOptions)}
+    (keywords,) = get_args(get_type_hints(RewardClient.episode, localns={"Unpack": Unpack})["options"])
+    assert get_type_hints(keywords) == {field.name: options[field.name] for field in fields(EpisodeOptions)}
 
 
 @pytest.mark.parametrize(

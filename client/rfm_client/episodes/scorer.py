@@ -168,13 +168,12 @@ class StepScorer:
     ) -> Sequence[ProgressResult]:
         request_id = next(call.request_ids)
         num_bytes = _padded_bytes(len(windows), len(sent), sent[0].nbytes if sent else 0)
-        videos, tasks = [window.digests for window in windows], [window.task for window in windows]
+        videos, tasks = (
+            [[frame.digest for frame in window.frames] for window in windows],
+            [window.task for window in windows],
+        )
         tensors = partial(wire.encode_refs, videos, tasks, sent)
-        try:
-            answer = await self._scorer.infer(self._model, num_bytes, tensors, outputs, call, request_id)
-        except RewardError as error:
-            error.request_id = request_id
-            raise
+        answer = await self._scorer.infer(self._model, num_bytes, tensors, outputs, call, request_id)
         return [
             wire.decode_progress(answer.tensors, row, len(window.frames), answer.model_version)
             for row, window in enumerate(windows)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rfm_client.command_line import PlotOutput, number, print_table, with_options
+from rfm_client.command_line import JsonOutput, number, print_table, with_options
 from rfm_client.options import setting
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ LEGEND = (
 
 
 @dataclass(frozen=True)
-class EvaluationOutput(PlotOutput):
+class EvaluationOutput(JsonOutput):
     """Output files for an evaluation."""
 
     plot: Path | None = setting(
@@ -59,7 +59,7 @@ def evaluate(
     """
     from rfm_labels import DatasetError, evaluate_labels, find_label_files, read_outcomes
 
-    output.check_folders()
+    output.begin()
     if not dataset.exists():
         raise DatasetError.at(dataset, "a labelled dataset", "no file or folder of this name")
     files = labels or find_label_files(dataset)
