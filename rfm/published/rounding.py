@@ -12,15 +12,18 @@ import torch
 from torch import Tensor
 
 from rfm.config import Weights
+from rfm.engine.family import Checkpoint
 from rfm.files import NETWORK_CONFIG, CheckpointError, shown
 from rfm.published.nf4 import dequantize
 from rfm.published.qwen import NF4, QUANTIZED, UNQUANTIZED, check_not_quantized, quantization
 from rfm.published.weights import read_weights
+from rfm.qwen.checkpoint import LORA, QwenCheckpoint
 from rfm.qwen.lora import changed_by, merged
 from rfm.qwen.rounded import may_be_rounded, rounded
 from rfm.weights import DECODED
 
 _NF4: Weights = "nf4"
+_BACKBONE = "model."  # prefix of the backbone's weights
 
 
 def read_unrounded_config(backbone: dict[str, Any], file: Path) -> bool:
@@ -58,32 +61,25 @@ def kind_of(weights: Mapping[str, Tensor]) -> Weights | None:
     return _NF4 if any(name.endswith(DECODED) for name in weights) else None
 
 
-def round_layers(
-    weights: Mapping[str, Tensor], factors: Mapping[str, Tensor], kind: Weights, dtype: torch.dtype
-) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Return the weights with rounded layers, and the LoRA factors for the others.
+def rounded_as_asked(checkpoint: Checkpoint, kind: Weights | None) -> Checkpoint:
+    """Return the checkpoint, with the backbone's layers rounded if the user asks for it. Raises CheckpointError.
 
-    factors: LoRA factors, which are added before rounding
-    dtype: type of decoded values
+    LoRA factors of these layers are added before rounding.
+    kind: the user's option; None, another network, or layers that are already rounded: nothing changes
     """
+    if kind is None or not isinstance(checkpoint, QwenCheckpoint) or checkpoint.config.weights is not None:
+        return checkpoint
+    factors = {**checkpoint.parts.get(LORA, {})}
     whole: dict[str, Tensor] = {}
-    rest = dict(factors)
-    for name, weight in weights.items():
-        if not (may_be_rounded(name) and weight.ndim == 2 and weight.shape[1] % 2 == 0):
+    for name, weight in checkpoint.weights.items():
+        is_layer = name.startswith(_BACKBONE) and may_be_rounded(name)
+        if not (is_layer and weight.ndim == 2 and weight.shape[1] % 2 == 0):
             whole[name] = weight
             continue
-        own = {factor: rest.pop(factor) for factor in factors if changed_by(factor) == name}
-        whole |= rounded(name, merged({name: weight}, own, torch.float32)[name], kind, dtype)
-    return whole, rest
-
-
-def rounded_as_asked(
-    config: Any, weights: dict[str, Tensor], factors: dict[str, Tensor], kind: Weights | None
-) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
-    """Return a checkpoint's configuration, weights and LoRA factors, with layers rounded if the user asks for it.
-
-    kind: the user's option; None, or layers that are already rounded: nothing changes
-    """
-    if kind is None or config.weights is not None:
-        return config, weights, factors
-    return replace(config, weights=kind), *round_layers(weights, factors, kind, config.torch_dtype)
+        own = {factor: factors.pop(factor) for factor in [*factors] if changed_by(factor) == name}
+        matrix = merged({name: weight}, own, torch.float32)[name]
+        whole |= rounded(name, matrix, kind, checkpoint.config.torch_dtype)
+    left: dict[str, Any] = {"factors": factors} if LORA in checkpoint.parts else {}
+    changed = replace(checkpoint, config=replace(checkpoint.config, weights=kind), weights=whole, **left)
+    changed.check()
+    return changed

@@ -21,7 +21,7 @@ from rfm.published.language import dtype_of
 from rfm.published.provenance import Assumption, source_name
 from rfm.published.qwen import QWEN_NAMES, UNUSED, backbone_config, renamed
 from rfm.published.reader import Loaded, Reader
-from rfm.published.rounding import read_published, read_unrounded_config, rounded_as_asked
+from rfm.published.rounding import read_published, read_unrounded_config
 from rfm.qwen.language import EMBEDDING
 from rfm.qwen.network import QWEN3
 from rfm.qwen.processor import PROCESSOR_CONFIG, pixel_limits, read_processor
@@ -193,7 +193,6 @@ def _edges(edges: Any, count: int, where: str) -> tuple[float, ...]:
 
 MODEL_TYPE = "rynn_value_lang"
 _EXAMPLE = '--robot-description "a Franka single-arm robot" --camera-description "the main right camera"'
-_BACKBONE_PREFIX = "model."  # prefix of the backbone's weights
 
 
 def reads(folder: Path) -> bool:
@@ -238,26 +237,17 @@ def _published(folder: Path, content: dict[str, Any], options: CheckpointConfig)
         **{**fields, **limits, **(meta if fields["use_meta"] else {})},
     )
     notes = [f"{name}: not expected, and not used: scores may differ from the original's" for name in read.unexpected]
-    checkpoint = _rounded(RynnCheckpoint(config, weights, processor), options)
+    checkpoint = RynnCheckpoint(config, weights, processor)
+    checkpoint.check()
     return Loaded(checkpoint, (*of_dtype, *read.assumptions), lambda: notes)
 
 
 def _exported(folder: Path, options: CheckpointConfig) -> Loaded:
-    """Load an export, with the processor, descriptions and weight format that the user asks for."""
+    """Load an export, with the processor and descriptions that the user asks for."""
     checkpoint = RynnCheckpoint.restore(folder)
     changed = _descriptions(options) if checkpoint.config.use_meta else {}
     config, processor = replace(checkpoint.config, **changed), options.base_model or checkpoint.processor
-    return Loaded(_rounded(replace(checkpoint, config=config, processor=processor), options))
-
-
-def _rounded(checkpoint: RynnCheckpoint, options: CheckpointConfig) -> RynnCheckpoint:
-    """Return the checkpoint, with the backbone's layers rounded if the user asks for it, and checked."""
-    ours = {name: each for name, each in checkpoint.weights.items() if name.startswith(_BACKBONE_PREFIX)}
-    heads = {name: each for name, each in checkpoint.weights.items() if name not in ours}
-    config, ours, _ = rounded_as_asked(checkpoint.config, ours, {}, options.weights)
-    checkpoint = replace(checkpoint, config=config, weights={**ours, **heads})
-    checkpoint.check()
-    return checkpoint
+    return Loaded(replace(checkpoint, config=config, processor=processor))
 
 
 def _set_rows(backbone: dict[str, Any], weights: Mapping[str, Tensor], file: Path) -> None:

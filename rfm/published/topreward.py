@@ -70,7 +70,7 @@ def load(folder: Path, options: CheckpointConfig) -> Loaded:
     config = TopRewardConfig(**files.made_of, **_settings(files, of_lerobot, options))
     checkpoint = TopRewardCheckpoint(config, files.weights, files.processor)
     checkpoint.check()
-    return Loaded(checkpoint, files.assumptions(config))
+    return Loaded(checkpoint, files.assumed)
 
 
 def _named_by_lerobot(content: Mapping[str, Any], options: CheckpointConfig) -> LanguageFolder:
