@@ -31,9 +31,7 @@ def find(source: str | Path, say: Callable[[str], object] = _log.warning) -> Pat
         if str(source) and path.is_dir():
             return path
         if path.is_file():
-            is_weights = path.suffix == ".safetensors"
-            remedy = f"name its folder, {path.absolute().parent}" if is_weights else ""
-            raise CheckpointError.at("checkpoint", _SOURCE, f"the file {path}", remedy)
+            raise CheckpointError.at("checkpoint", _SOURCE, f"the file {path}", f"name its folder, {path.parent}")
     except (OSError, RuntimeError) as error:
         got = f"{shown(str(source))}: {type(error).__name__}"
         raise CheckpointError.at("checkpoint", _SOURCE, got) from error

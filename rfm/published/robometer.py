@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -16,7 +17,7 @@ from torch import Tensor
 from rfm.config import CheckpointConfig
 from rfm.families.robometer.checkpoint import VlmCheckpoint, restore
 from rfm.families.robometer.network import VlmConfig
-from rfm.families.robometer.prompts import OLD_RUN_REMEDY, VlmCollator
+from rfm.families.robometer.prompts import OLD_RUN_REMEDY
 from rfm.files import (
     ADAPTER_CONFIG,
     NETWORK_CONFIG,
@@ -52,7 +53,6 @@ from rfm.published.robometer_run import (
 from rfm.published.rounding import kind_of, read_published, read_unrounded_config
 from rfm.published.run_config import check_progress
 from rfm.published.weights import has_head, read_weights
-from rfm.qwen.collator import Chat, Visual
 from rfm.qwen.lora import changed_by, split
 from rfm.qwen.network import BACKBONES, QWEN3, QWEN_2_5
 from rfm.saved import PROCESSOR_FOLDER, is_saved
@@ -70,30 +70,21 @@ def reads(folder: Path) -> bool:
 def load(folder: Path, options: CheckpointConfig) -> Loaded:
     """Load a checkpoint from a local folder. Raises CheckpointError."""
     checkpoint, assumptions = (restore(folder), ()) if is_saved(folder) else _published(folder, options)
-    has_processor = options.base_model is None and isinstance(checkpoint.processor, Path)
     checkpoint = replace(checkpoint, processor=options.base_model or checkpoint.processor)
     checkpoint.check()
-    return Loaded(checkpoint, assumptions, lambda: _notes(checkpoint, has_processor=has_processor))
+    return Loaded(checkpoint, assumptions, partial(_notes, checkpoint.config))
 
 
-def _notes(checkpoint: VlmCheckpoint, *, has_processor: bool) -> list[str]:
-    """Return one line per sign that prompts, images or positions differ from those in training.
-
-    has_processor: the processor is the checkpoint's own
-    """
-    config, lines = checkpoint.config, []
-    if not has_processor and (found := _differences(checkpoint.collator)):
-        known = f"the published processors of {config.family}"
-        lines.append(f"base model {checkpoint.processor}: differs from {known} in {'; '.join(found)}")
+def _notes(config: VlmConfig) -> list[str]:
+    """Return a line if text behind videos may have had other positions in training."""
     version = str(config.backbone.get("transformers_version"))
     major = version.partition(".")[0]
-    if config.family == QWEN_2_5 and not config.multi_image and major.isdigit() and int(major) >= 5:
-        lines.append(
-            f"{NETWORK_CONFIG}: transformers_version is {version}: text behind a video stands where transformers 4 "
-            "puts it; if the run was trained with transformers 5, which puts it elsewhere, scores differ from the "
-            "run's"
-        )
-    return lines
+    if config.family != QWEN_2_5 or config.multi_image or not major.isdigit() or int(major) < 5:
+        return []
+    return [
+        f"{NETWORK_CONFIG}: transformers_version is {version}: text behind a video stands where transformers 4 puts "
+        "it; if the run was trained with transformers 5, which puts it elsewhere, scores differ from the run's"
+    ]
 
 
 _Read: TypeAlias = tuple[VlmConfig, dict[str, Tensor], dict[str, Tensor], tuple[Assumption, ...]]
@@ -176,29 +167,6 @@ def _used(tensors: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, T
     weights, factors = split(tensors)
     weights = {name: tensor for name, tensor in weights.items() if not UNUSED.fullmatch(name)}
     return weights, {name: tensor for name, tensor in factors.items() if changed_by(name) in weights}
-
-
-# The published processors by backbone family, with which another is compared.
-_QWEN_PROMPT = "<|im_start|>user\nTASK{visual} 1: <|vision_start|><|{pad}_pad|><|vision_end|><|im_end|>\n"
-_FACTS: dict[str, dict[str, Any]] = {
-    QWEN_2_5: {
-        "prompt": f"<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n{_QWEN_PROMPT}",
-        "image_mean": (0.48145466, 0.4578275, 0.40821073),
-        "image_std": (0.26862954, 0.26130258, 0.27577711),
-    },
-    QWEN3: {"prompt": _QWEN_PROMPT, "image_mean": (0.5,) * 3, "image_std": (0.5,) * 3},
-}
-
-
-def _differences(collator: VlmCollator) -> list[str]:
-    """Return the differences between a processor and those published for its backbone family."""
-    is_image = collator.config.multi_image
-    words = {"visual": "Picture", "pad": "image"} if is_image else {"visual": "Video", "pad": "video"}
-    known = {**_FACTS[collator.config.family]}
-    known["prompt"] = known["prompt"].format(**words)
-    text = Chat(collator.tokenizer).text(("TASK", Visual.IMAGE if is_image else Visual.VIDEO))
-    got = {"prompt": text, **collator.images.to_config()}
-    return [f"{name}: expected {value!r}, got {got[name]!r}" for name, value in known.items() if got[name] != value]
 
 
 READER = Reader(reads, load)

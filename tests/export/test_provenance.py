@@ -147,25 +147,6 @@ def test_a_base_model_under_another_name_is_assumed_aloud(vlm: Copy) -> None:
     assert line.startswith(f"{TOLD}{expected}")  # the whole path may be private
 
 
-CONTRADICTIONS: dict[str, tuple[str, str, object, str]] = {
-    "chat template": ("chat_template.json", "chat_template", "Hello.", "prompt: expected '<|im_start|>user"),
-    "image statistics": (
-        *("preprocessor_config.json", "image_mean", [0.485, 0.456, 0.406]),
-        "image_mean: expected (0.5, 0.5, 0.5), got (0.485, 0.456, 0.406)",
-    ),
-}
-
-
-@pytest.mark.parametrize(("file", "key", "value", "expected"), CONTRADICTIONS.values(), ids=CONTRADICTIONS)
-def test_a_processor_unlike_the_published_one_is_noted(
-    vlm: Copy, file: str, key: str, value: Any, expected: str
-) -> None:
-    folder, base = vlm(PLAIN)
-    rewritten(base / file, lambda content: content.update({key: value}))
-    (line,) = notes(folder, base)
-    assert line.startswith(f"base model {base}: differs from the published processors of qwen3_vl in {expected}")
-
-
 def test_tokens_of_other_numbers_are_refused(vlm: Copy) -> None:
     folder, base = vlm(PLAIN)
     config = (folder / "config.json").read_text()
