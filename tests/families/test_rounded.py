@@ -26,7 +26,7 @@ from rfm import published
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.published import CheckpointError
-from rfm.published.nf4 import dequantize
+from rfm.published.rounding import dequantize
 from rfm.qwen.rounded import Int8Linear, Nf4Linear, RoundedLinear, fit, quantize, rounded
 from rfm_client import ModelInfo, ProgressSample
 from rfm_commands.engine_scorer import EngineScorer
