@@ -20,25 +20,20 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from google.protobuf.text_format import ParseError
 
 from rfm import published
 from rfm.config import ExportConfig
 from rfm.engine.device import computation
 from rfm.engine.family import NETWORK, Checkpoint, Family, FrameEncoders, config_fields
 from rfm.files import read_run_config
-from rfm.parameters import CHECKPOINT_FOLDER
 from rfm.published.hub import check_links, commit_of
 from rfm.published.provenance import Assumption, is_folder, license_of, source_name
 from rfm.published.run_config import find_run_config
-from rfm.serve.repository import CONFIG_FILE
 from rfm.weights import num_values
 from rfm_client.contract import ProgressSample
 from rfm_client.contract.description import Description, Origin
 from rfm_client.contract.samples import random_trajectory
 from rfm_export.errors import ExportError
-from rfm_export.layout import description_in
-from rfm_export.pbtxt import parse
 
 Printer: TypeAlias = Callable[[str], object]  # receives a line for the user
 
@@ -190,7 +185,7 @@ def typical_sample(checkpoint: Checkpoint) -> ProgressSample:
 
 
 def origin_of(source: str | Path, folder: Path, computation: str) -> Origin:
-    """Return the checkpoint's origin: source, commit, training run's config.yaml, licence, effect of rounded weights.
+    """Return the checkpoint's origin: source, commit, training run's config.yaml, licence.
 
     For a folder, the source is the end of its path. config.yaml becomes JSON without secrets.
 
@@ -205,19 +200,7 @@ def origin_of(source: str | Path, folder: Path, computation: str) -> Origin:
         license=license_of(folder),
         run_config={} if file is None else _public(read_run_config(file)),
         computation=computation,
-        weights_difference=_earlier_difference(folder),
     )
-
-
-def _earlier_difference(folder: Path) -> float | None:
-    """Return the difference that an export measured when it wrote this folder; None: not measured, or no export."""
-    kept = folder.parent / CONFIG_FILE  # in the version folder
-    if folder.name != CHECKPOINT_FOLDER or not kept.is_file():
-        return None
-    try:
-        return description_in(parse(kept.read_text())).weights_difference
-    except (ParseError, ValueError):  # exports from before descriptions existed measured nothing
-        return None
 
 
 def origin_in(description: Description) -> Origin:

@@ -10,6 +10,7 @@ safetensors, and YAML tags construct no objects.
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from rfm.files import WEIGHTS, CheckpointError
 from rfm.published.hub import find as find
 from rfm.published.provenance import assumption_lines
 from rfm.published.reader import Loaded, Reader, asked, check_used
+from rfm.published.rounding import rounded_as_asked
 from rfm.published.run_config import HEADS, SIMILARITY, constant_heads, training_notes
 from rfm.weights import check_values
 from rfm_client.contract.checks import require
@@ -72,6 +74,7 @@ def load(source: str | Path, **options: Any) -> Checkpoint:
 def read_from(folder: Path, family: Family, options: CheckpointConfig) -> Loaded:
     """Read a checkpoint from a local folder. Raises CheckpointError, also for non-finite weights or zero matrices."""
     loaded = reader_of(family).load(folder, options)
+    loaded = replace(loaded, checkpoint=rounded_as_asked(loaded.checkpoint, options.weights))
     check_used(options, loaded.checkpoint.config)
     for weights in loaded.checkpoint.parts.values():
         check_values(weights)

@@ -30,7 +30,6 @@ from rfm.files import (
     read_tensors,
     shown,
 )
-from rfm.published.nf4 import dequantize
 from rfm.published.qwen import (
     ADAPTER_NAMES,
     NF4,
@@ -41,6 +40,7 @@ from rfm.published.qwen import (
     quantization,
     renamed,
 )
+from rfm.published.rounding import dequantize
 from rfm.published.weights import read_weights, refuse_pickles
 from rfm.qwen.lora import BASE_LAYER, LORA_NAME, MERGE, module_of
 from rfm.qwen.network import BackboneConfig, build_backbone

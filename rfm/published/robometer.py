@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -50,7 +51,7 @@ from rfm.published.robometer_run import (
     lerobot_run,
     lerobot_weights,
 )
-from rfm.published.rounding import kind_of, read_published, read_unrounded_config, rounded_as_asked
+from rfm.published.rounding import kind_of, read_published, read_unrounded_config
 from rfm.published.run_config import check_progress
 from rfm.published.weights import has_head, read_weights
 from rfm.qwen.collator import Chat, Visual
@@ -70,19 +71,14 @@ def reads(folder: Path) -> bool:
 
 def load(folder: Path, options: CheckpointConfig) -> Loaded:
     """Load a checkpoint from a local folder. Raises CheckpointError."""
-    assumptions: tuple[Assumption, ...] = ()
-    if is_saved(folder):
-        parts = _exported(folder)
-    else:
-        parts, assumptions = _published(folder, options)
-    config, weights, factors, processor = parts
-    config, weights, factors = rounded_as_asked(config, weights, factors, options.weights)
-    has_processor = options.base_model is None and isinstance(processor, Path)
-    checkpoint = VlmCheckpoint(config, weights, options.base_model or processor, factors)
+    checkpoint, assumptions = (restore(folder), ()) if is_saved(folder) else _published(folder, options)
+    base_model, config = options.base_model, checkpoint.config
+    has_processor = base_model is None and isinstance(checkpoint.processor, Path)
+    checkpoint = replace(checkpoint, processor=base_model or checkpoint.processor)
     checkpoint.check()
-    if options.base_model is not None and re.fullmatch(_PUBLISHED_NAMES[config.family], config.base_model_id):
-        _check_published(checkpoint.collator, options.base_model)
-    return Loaded(checkpoint, assumptions, lambda: _notes(checkpoint, has_processor=has_processor))
+    if base_model is not None and re.fullmatch(_PUBLISHED_NAMES[config.family], config.base_model_id):
+        _check_published(checkpoint.collator, base_model)
+    return Loaded(checkpoint, assumptions, partial(_notes, checkpoint, has_processor=has_processor))
 
 
 def _check_published(collator: VlmCollator, processor: str) -> None:
@@ -116,38 +112,21 @@ def _notes(checkpoint: VlmCheckpoint, *, has_processor: bool) -> list[str]:
     return lines
 
 
-_Parts: TypeAlias = tuple[VlmConfig, dict[str, Tensor], dict[str, Tensor], str | Path]
 _Read: TypeAlias = tuple[VlmConfig, dict[str, Tensor], dict[str, Tensor], tuple[Assumption, ...]]
 
 
-def _exported(folder: Path) -> _Parts:
-    """Return an export's parts; the caller may change its processor and weight format."""
-    restored = restore(folder)
-    return restored.config, restored.weights, restored.factors, restored.processor
-
-
-def _published(folder: Path, options: CheckpointConfig) -> tuple[_Parts, tuple[Assumption, ...]]:
+def _published(folder: Path, options: CheckpointConfig) -> tuple[VlmCheckpoint, tuple[Assumption, ...]]:
     with expecting("a vision-language checkpoint", folder):
         content = {} if has_adapter(folder) else read_json(folder / NETWORK_CONFIG)
         read = _by_lerobot if is_lerobot(content) else _trained
         config, weights, factors, assumptions = read(folder, content, options.base_model)
         if config.family == QWEN3 and not config.multi_image:
-            config, form = _with_video_prompt(config, content, options)
-            assumptions = (*assumptions, *form)
+            file = f"{NETWORK_CONFIG}: {LEROBOT_BACKBONE}" if is_lerobot(content) else NETWORK_CONFIG
+            # An adapter has no config.json: another transformers may have saved its base model.
+            form, of_form = decided(options.video_prompt, config.backbone if content else {}, file)
+            config, assumptions = replace(config, video_prompt=form), (*assumptions, *of_form)
     own = folder / PROCESSOR_FOLDER
-    return (config, weights, factors, own if own.is_dir() else config.base_model_id), assumptions
-
-
-def _with_video_prompt(
-    config: VlmConfig, content: Mapping[str, Any], options: CheckpointConfig
-) -> tuple[VlmConfig, tuple[Assumption, ...]]:
-    """Return the configuration with the form of its video prompts, and the form if it is assumed.
-
-    content: the run's config.json; empty for an adapter, whose base model another transformers may have saved
-    """
-    file = f"{NETWORK_CONFIG}: {LEROBOT_BACKBONE}" if is_lerobot(content) else NETWORK_CONFIG
-    form, assumed = decided(options.video_prompt, config.backbone if content else {}, file)
-    return replace(config, video_prompt=form), assumed
+    return VlmCheckpoint(config, weights, own if own.is_dir() else config.base_model_id, factors), assumptions
 
 
 def _by_lerobot(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Read:

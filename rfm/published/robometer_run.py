@@ -94,14 +94,9 @@ class RunConfig:
 
     def check_model_type(self) -> None:
         """Raise CheckpointError for a checkpoint without reward heads, or with prompts that upstream has dropped."""
-        model_type, why = self.get("model.model_type", HEADS), ""
-        if model_type == VQA:
-            why = (
-                ": such a checkpoint answers in generated text, upstream's server and its training collator prompt it "
-                "in different ways, and upstream's successor dropped the type"
-            )
-        if model_type != HEADS:
-            raise CheckpointError.at(f"{self.file}: model.model_type", HEADS, f"{shown(model_type)}{why}")
+        if (model_type := self.get("model.model_type", HEADS)) != HEADS:
+            remedy = "models that answer in generated text are not served" if model_type == VQA else ""
+            raise CheckpointError.at(f"{self.file}: model.model_type", HEADS, shown(model_type), remedy)
         for section in ("model", "data"):
             for key in _DROPPED:
                 if self.get(f"{section}.{key}", False):

@@ -20,6 +20,7 @@ from rfm.files import (
     read_run_config,
     shown,
 )
+from rfm.published.provenance import snapshot_of
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -63,9 +64,8 @@ def _check_base(file: Path, folder: Path) -> None:
 
 def _places_on_main(home: Path) -> list[Path]:
     """Return ``home`` (and its parent, for a subfolder) in main's snapshot in the Hub's cache."""
-    snapshot = next((path for path in (home, *home.parents) if path.parent.name == "snapshots"), home)
-    main = snapshot.parent.parent / "refs" / "main"
-    if snapshot.parent.name != "snapshots" or not is_there(main):
+    snapshot = snapshot_of(home)
+    if snapshot is None or not is_there(main := snapshot.parent.parent / "refs" / "main"):
         return []
     with main.open("rb") as file:
         commit = file.read(_COMMIT_DIGITS + 1)

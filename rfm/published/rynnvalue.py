@@ -10,18 +10,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
-from torch import Tensor
-
 from rfm.config import CheckpointConfig
 from rfm.families.rynnvalue.checkpoint import RynnCheckpoint
 from rfm.families.rynnvalue.network import ACTIVATIONS, Bins, HeadConfig, RynnConfig, Transform
 from rfm.families.rynnvalue.prompts import META, RELATIVE_TOKEN, VALUE_TOKEN
 from rfm.files import NETWORK_CONFIG, CheckpointError, is_there, network_config, read_json, shown
-from rfm.published.language import dtype_of
+from rfm.published.language import dtype_of, reopened
 from rfm.published.provenance import Assumption, source_name
 from rfm.published.qwen import QWEN_NAMES, UNUSED, backbone_config, renamed
 from rfm.published.reader import Loaded, Reader
-from rfm.published.rounding import read_published, read_unrounded_config, rounded_as_asked
+from rfm.published.rounding import read_published, read_unrounded_config
 from rfm.qwen.language import EMBEDDING
 from rfm.qwen.network import QWEN3
 from rfm.qwen.processor import PROCESSOR_CONFIG, pixel_limits, read_processor
@@ -193,7 +191,6 @@ def _edges(edges: Any, count: int, where: str) -> tuple[float, ...]:
 
 MODEL_TYPE = "rynn_value_lang"
 _EXAMPLE = '--robot-description "a Franka single-arm robot" --camera-description "the main right camera"'
-_BACKBONE_PREFIX = "model."  # prefix of the backbone's weights
 
 
 def reads(folder: Path) -> bool:
@@ -202,9 +199,11 @@ def reads(folder: Path) -> bool:
 
 
 def load(folder: Path, options: CheckpointConfig) -> Loaded:
-    """Load a checkpoint from a local folder. Raises CheckpointError."""
+    """Load a checkpoint from a local folder, with the user's processor and descriptions. Raises CheckpointError."""
     if is_saved(folder):
-        return _exported(folder, options)
+        checkpoint = reopened(RynnCheckpoint, folder, options)
+        changed = _descriptions(options) if checkpoint.config.use_meta else {}
+        return Loaded(replace(checkpoint, config=replace(checkpoint.config, **changed)))
     content = read_json(folder / NETWORK_CONFIG)
     if content.get("model_type") != MODEL_TYPE:
         got = shown(content.get("model_type"))
@@ -221,7 +220,9 @@ def _published(folder: Path, content: dict[str, Any], options: CheckpointConfig)
     backbone = backbone_config({**rest, "model_type": QWEN3}, file)
     tensors, _ = read_published(folder, read_unrounded_config(backbone, file), MODEL_TYPE)
     weights = {name: each for name, each in renamed(tensors, QWEN_NAMES).items() if not UNUSED.fullmatch(name)}
-    _set_rows(backbone, weights, file)
+    if EMBEDDING not in weights:
+        raise CheckpointError.at(folder, f"a weight {EMBEDDING}", "none")
+    backbone["text_config"]["vocab_size"] = len(weights[EMBEDDING])  # its padding may have been kept or cut
     processor = options.base_model or folder
     tokenizer, preprocessor = read_processor(processor)
     fields["value_token"] = read.token("value_token_id", VALUE_TOKEN, tokenizer)
@@ -238,33 +239,9 @@ def _published(folder: Path, content: dict[str, Any], options: CheckpointConfig)
         **{**fields, **limits, **(meta if fields["use_meta"] else {})},
     )
     notes = [f"{name}: not expected, and not used: scores may differ from the original's" for name in read.unexpected]
-    checkpoint = _rounded(RynnCheckpoint(config, weights, processor), options)
-    return Loaded(checkpoint, (*of_dtype, *read.assumptions), lambda: notes)
-
-
-def _exported(folder: Path, options: CheckpointConfig) -> Loaded:
-    """Load an export, with the processor, descriptions and weight format that the user asks for."""
-    checkpoint = RynnCheckpoint.restore(folder)
-    changed = _descriptions(options) if checkpoint.config.use_meta else {}
-    config, processor = replace(checkpoint.config, **changed), options.base_model or checkpoint.processor
-    return Loaded(_rounded(replace(checkpoint, config=config, processor=processor), options))
-
-
-def _rounded(checkpoint: RynnCheckpoint, options: CheckpointConfig) -> RynnCheckpoint:
-    """Return the checkpoint, with the backbone's layers rounded if the user asks for it, and checked."""
-    ours = {name: each for name, each in checkpoint.weights.items() if name.startswith(_BACKBONE_PREFIX)}
-    heads = {name: each for name, each in checkpoint.weights.items() if name not in ours}
-    config, ours, _ = rounded_as_asked(checkpoint.config, ours, {}, options.weights)
-    checkpoint = replace(checkpoint, config=config, weights={**ours, **heads})
+    checkpoint = RynnCheckpoint(config, weights, processor)
     checkpoint.check()
-    return checkpoint
-
-
-def _set_rows(backbone: dict[str, Any], weights: Mapping[str, Tensor], file: Path) -> None:
-    """Take the embedding's row count from the weights: its padding may have been kept or cut."""
-    if EMBEDDING not in weights:
-        raise CheckpointError.at(file.parent, f"a weight {EMBEDDING}", "none")
-    backbone["text_config"]["vocab_size"] = len(weights[EMBEDDING])
+    return Loaded(checkpoint, (*of_dtype, *read.assumptions), lambda: notes)
 
 
 def _descriptions(options: CheckpointConfig) -> dict[str, str]:

@@ -64,19 +64,14 @@ def load(folder: Path, options: CheckpointConfig) -> Loaded:
         if name == ROBOMETER:
             raise CheckpointError.at("--as", f"{LEROBOT} for a config.json of LeRobot", name)
         of_lerobot = _lerobot_settings(content, folder / NETWORK_CONFIG)
-        files = _named_by_lerobot(content, options)
+        named = find(options.base_model or str(content.get("vlm_name")))
+        files = LanguageFolder.read(named, replace(options, base_model=None))
     else:
         files = LanguageFolder.read(folder, options)
     config = TopRewardConfig(**files.made_of, **_settings(files, of_lerobot, options))
     checkpoint = TopRewardCheckpoint(config, files.weights, files.processor)
     checkpoint.check()
-    return Loaded(checkpoint, files.assumptions(config))
-
-
-def _named_by_lerobot(content: Mapping[str, Any], options: CheckpointConfig) -> LanguageFolder:
-    """Read the Qwen3-VL that LeRobot's config.json or the caller names."""
-    folder = find(options.base_model or str(content.get("vlm_name")))
-    return LanguageFolder.read(folder, replace(options, base_model=None))
+    return Loaded(checkpoint, files.assumed)
 
 
 def _settings(files: LanguageFolder, of_lerobot: Mapping[str, Any], options: CheckpointConfig) -> dict[str, Any]:

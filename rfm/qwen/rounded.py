@@ -5,7 +5,7 @@ So a row's scores do not depend on other rows in its batch, as they would with r
 per layer.
 
 int8: weight int8 [N, K] and scale [N, 1]; a value is weight * scale.
-nf4: weight uint8 [N, K / 2], two codes per byte, and scale float32 [blocks], described in ``rfm.published.nf4``.
+nf4: weight uint8 [N, K / 2], two codes per byte, and scale float32 [blocks], described in ``rfm.published.rounding``.
 """
 
 from __future__ import annotations

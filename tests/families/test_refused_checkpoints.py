@@ -263,7 +263,7 @@ SETTINGS: dict[str, tuple[str, Spoil, str]] = {
     "a pooling that is none": (Q3, run_settings("model", frame_pooling="max"), r"frame_pooling: expected"),
     "tokens without images": (Q3, in_yaml(lambda content: [content[part].update(use_multi_image=False) for part in ("model", "data")]), r"use_multi_image with per-frame progress tokens: expected true"),
     "two words on one setting": (Q3, run_settings("data", use_multi_image=False), r"expected model\.use_multi_image and data\.use_multi_image to agree, got model\.use_multi_image true and data\.use_multi_image false"),
-    "answers in generated text": (Q3, run_settings("model", model_type="vqa"), r"model\.model_type: expected default, got 'vqa': .* upstream's successor dropped the type"),
+    "answers in generated text": (Q3, run_settings("model", model_type="vqa"), r"model\.model_type: expected default, got 'vqa'; models that answer in generated text are not served"),
     "no reward heads": (Q3, weights(lambda w: w.pop("progress_head.4.weight")), r"expected reward heads, got no progress_head.4.weight"),
     "a run of before 2026-01-21": (Q3, weights(lambda w: w.pop("frame_pool_attn.weight")), r"expected frame_pool_attn\.weight, got none; a run of before 2026-01-21 had 8 special tokens"),
     "eight special tokens": (Q3, eight_special_tokens, r"tokens .*, got 451; .*a run of before 2026-01-21 had 8 special tokens"),

@@ -11,8 +11,15 @@ import numpy as np
 
 from rfm.engine.execution import Execution
 from rfm.engine.predictor import RowScores, no_success
-from rfm.families.robodopamine.answers import QUESTIONS, fused, hops, parsed, sampled_frames
-from rfm.families.robodopamine.prompts import RoboDopamineCollator, RoboDopamineConfig
+from rfm.families.robodopamine.prompts import (
+    QUESTIONS,
+    RoboDopamineCollator,
+    RoboDopamineConfig,
+    fused,
+    hops,
+    parsed,
+    sampled_frames,
+)
 from rfm.qwen.batch import VlmRow
 from rfm.qwen.language import LanguageCheckpoint
 from rfm.qwen.written import WritingPredictor, WrittenAnswer, progress_of

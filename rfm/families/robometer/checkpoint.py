@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -128,8 +127,20 @@ class VlmCheckpoint(QwenCheckpoint):
 
     def load_collator(self) -> VlmCollator:
         """Return the sample collator. Raises CheckpointError if the processor is missing or does not fit."""
-        embedding = next(t for name, t in self.weights.items() if name.endswith("embed_tokens.weight"))
-        return load_collator(self.config, len(embedding), self.processor)
+        config, processor = self.config, self.processor
+        num_tokens = next(len(each) for name, each in self.weights.items() if name.endswith("embed_tokens.weight"))
+        tokenizer, preprocessor = read_processor(processor, videos=not config.multi_image)
+        tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
+        if len(tokenizer) != num_tokens:  # upstream resizes the embedding to the tokenizer
+            expected = f"a tokenizer of {num_tokens} tokens with the special ones, as the checkpoint's embedding"
+            remedy = f"name the run's base model with --base-model; {OLD_RUN_REMEDY}"
+            raise CheckpointError.at(f"base model {processor}", expected, len(tokenizer), remedy)
+        first = len(tokenizer) - len(SPECIAL_TOKENS)
+        check_tokens(config, tokenizer, processor, {token: first + index for index, token in enumerate(SPECIAL_TOKENS)})
+        where = f"base model {processor}: preprocessing of {'images' if config.multi_image else 'videos'}"
+        normalisation = normalisation_of(preprocessor, SIZED_BEFORE, where)
+        patch = patch_px(preprocessor, config.backbone["vision_config"], where)
+        return VlmCollator(config, tokenizer, QwenImages(patch, normalisation, config.size_px))
 
 
 def restore(folder: Path) -> VlmCheckpoint:
@@ -151,32 +162,3 @@ def frame_size(config: VlmConfig) -> FrameSize | None:
         return None
     factor = config.backbone["vision_config"]["patch_size"] * MERGE * (1 if config.multi_image else FRAMES_PER_GROUP)
     return FrameSize("exact", fitted_size(*config.size_px, factor))
-
-
-def load_collator(config: VlmConfig, num_tokens: int, processor: str | Path) -> VlmCollator:
-    """Load a checkpoint's collator. Raises CheckpointError for a processor that is missing or does not fit.
-
-    num_tokens: rows in the checkpoint's token embedding
-    processor: folder or id with tokenizer and image preprocessing
-    """
-    tokenizer, preprocessor = read_processor(processor, videos=not config.multi_image)
-    tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
-    if len(tokenizer) != num_tokens:  # upstream resizes the embedding to the tokenizer
-        expected = f"a tokenizer of {num_tokens} tokens with the special ones, as the checkpoint's embedding"
-        remedy = f"name the run's base model with --base-model; {OLD_RUN_REMEDY}"
-        raise CheckpointError.at(f"base model {processor}", expected, len(tokenizer), remedy)
-    _check_special_tokens(config, tokenizer, processor)
-    return _collator(config, tokenizer, preprocessor, processor)
-
-
-def _check_special_tokens(config: VlmConfig, tokenizer: Any, processor: str | Path) -> None:
-    first = len(tokenizer) - len(SPECIAL_TOKENS)
-    check_tokens(config, tokenizer, processor, {token: first + index for index, token in enumerate(SPECIAL_TOKENS)})
-
-
-def _collator(config: VlmConfig, tokenizer: Any, preprocessor: dict[str, Any], processor: str | Path) -> VlmCollator:
-    where = f"base model {processor}: preprocessing of {'images' if config.multi_image else 'videos'}"
-    vision = config.backbone["vision_config"]
-    normalisation = normalisation_of(preprocessor, SIZED_BEFORE, where)
-    images = QwenImages(patch_px(preprocessor, vision, where), normalisation, config.size_px)
-    return VlmCollator(config, tokenizer, images)
