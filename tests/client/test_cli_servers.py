@@ -217,7 +217,7 @@ def test_exit_codes_are_documented_with_every_command() -> None:
 
 NUM_SOURCES = 1000  # more than are scored before the server is gone
 NOT_ASKED = "not asked, since no server answers any more"
-NO_GRPC = "no answer of a gRPC server: give Triton's gRPC port (by default 8001)"
+NO_GRPC = "no answer of Triton's gRPC port (by default 8001)"
 OF_HTTP = "Triton's HTTP port (by default 8000)"
 PORTS = {
     ("grpc", "http_port"): (ExitCode.UNAVAILABLE, NO_GRPC),

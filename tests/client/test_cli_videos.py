@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 import clip
-from client_commands import MODEL, TASK, WIDTHS, ask, assert_scores, columns, invoke, run
+from client_commands import MODEL, TASK, WIDTHS, ask, assert_scores, columns, invoke, rows, run
 from engine_server import EngineServer
 from rfm_client import (
     FrameScores,

@@ -20,7 +20,7 @@ from servers import Endpoints
 
 NOBODY = "grpc://localhost:1"  # where no server listens
 STARTED = "start the server there (rfm serve), or give the URL of one that runs (https:// and grpcs:// only with TLS)"
-URL = "expected grpc://host:port or http://host:port, or grpcs:// or https://, got"
+URL = "expected grpc://host:port or http://host:port, or grpcs:// or https:// (brackets around an IPv6 address), got"
 DATASET = (
     "expected a LeRobot dataset (meta/info.json), an RLDS dataset (features.json), an HDF5 file (.hdf5, .h5), a folder "
     "of videos, of folders of pictures or of .npy and .npz files with tasks.csv, or a Hub id "

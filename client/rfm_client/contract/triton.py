@@ -73,7 +73,7 @@ _PREFIX = re.compile(r"^(\[request id: [^\]]*\] )?(in ensemble '[^']*', )?")  # 
 
 FEWER_FRAMES = "score some of them (subsample=True), each on few before it (frame_steps), or by a sampling rule"
 _START = "start the server there (rfm serve), or give the URL of one that runs (https:// and grpcs:// only with TLS)"
-_GRPC_PORT = "give Triton's gRPC port (by default 8001), or http:// for its HTTP port, or grpcs:// with TLS"
+_GRPC_PORT = "give that port, or http:// for the HTTP port, or grpcs:// with TLS"
 _NAME = "give the checkpoint's name with model (--model)"
 _SHOW_KEY = "show the key that it wants with api_key (--api-key-file) or headers"
 _TRUST = {
@@ -179,7 +179,7 @@ def unreachable(url: str, reason: str) -> errors.ServerUnavailableError:
     found = _REASON.search(reason)
     reason, remedy = (found[1] if found else reason), _START
     if url.startswith("grpc") and _NO_GRPC.search(reason):
-        reason, remedy = "no answer of a gRPC server", _GRPC_PORT
+        reason, remedy = "no answer of Triton's gRPC port (by default 8001)", _GRPC_PORT
     if proxy := grpc_proxy(url):
         remedy += f"; or add the host to no_proxy, unless {proxy} names the proxy that leads to it"
     return _with_remedy(errors.ServerUnavailableError, f"{url}: no connection: {reason}", remedy)
