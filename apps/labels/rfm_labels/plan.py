@@ -12,7 +12,16 @@ from pathlib import Path
 from typing import Any, get_args
 
 from rfm_client import InvalidSampleError, RewardError, UInt8Array
-from rfm_client.frames import ChannelOrder, Correction, FrameFileError, Fuse, Orientation, Picture, Sampling
+from rfm_client.frames import (
+    ChannelOrder,
+    Correction,
+    FrameFileError,
+    Fuse,
+    Orientation,
+    Picture,
+    Sampling,
+    resize_frames,
+)
 from rfm_client.options import InvalidValueError, first_names
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.datasets.faults import FaultsError, listed, require
@@ -134,6 +143,11 @@ class Recipe:
     def channels(self) -> Mapping[str, ChannelOrder]:
         """Stored channel order by camera, for cameras that do not store RGB."""
         return {camera: each.channels for camera, each in self.corrections.items() if each.channels != "rgb"}
+
+    def resized(self, frames: UInt8Array) -> UInt8Array:
+        """Return frames, uint8 [T, H, W, 3], in the size in which they are sent."""
+        size = self.checkpoint.frame_size if self.resize else None
+        return frames if size is None else resize_frames(frames, size)
 
     def in_one_pass(self, num_frames: int) -> bool:
         """True if one pass over ``num_frames`` frames scores every frame."""

@@ -34,7 +34,7 @@ from rfm_client import (
     Trajectory,
     UInt8Array,
 )
-from rfm_client.frames import BlankFrames, resize_frames
+from rfm_client.frames import BlankFrames
 from rfm_client.options import InvalidValueError
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.metadata import SCORES, Columns
@@ -234,16 +234,12 @@ def _columns(by_camera: Mapping[str, Sequence[ProgressResult]], episode: Dataset
 def _scores(trajectory: Trajectory, scorer: Scorer, recipe: Recipe, go_on: Callable[[], None]) -> ProgressResult:
     if recipe.in_one_pass(trajectory.num_frames):
         (result,) = scorer.evaluate([ProgressSample(trajectory)])
-        return _with_progress(result, recipe)
-    results: list[ProgressResult] = []
-    for together in _by_bytes(recipe.sampling.samples(trajectory)):
-        go_on()
-        results += scorer.evaluate(together)
-    return _with_progress(recipe.sampling.joined(results), recipe)
-
-
-def _with_progress(result: ProgressResult, recipe: Recipe) -> ProgressResult:
-    """Derive progress by the recipe's rule, if it has one. Raises InvalidSampleError."""
+    else:
+        results: list[ProgressResult] = []
+        for together in _by_bytes(recipe.sampling.samples(trajectory)):
+            go_on()
+            results += scorer.evaluate(together)
+        result = recipe.sampling.joined(results)
     if recipe.progress_rule is None:
         return result
     try:
@@ -256,10 +252,7 @@ def _shrunk(frames: Iterator[UInt8Array], recipe: Recipe, go_on: Callable[[], No
     """Yield arrays with at most FRAMES_AT_A_TIME frames, resized if the recipe says so."""
     while chunk := list(itertools.islice(frames, FRAMES_AT_A_TIME)):
         go_on()
-        stacked = np.stack(chunk)
-        if recipe.resize and recipe.checkpoint.frame_size is not None:
-            stacked = resize_frames(stacked, recipe.checkpoint.frame_size)
-        yield stacked
+        yield recipe.resized(np.stack(chunk))
 
 
 def _joined(parts: Sequence[Trajectory]) -> Trajectory:
@@ -272,9 +265,7 @@ def _held(
 ) -> Trajectory:
     """Return a trajectory for camera and views, given each one's first chunk and an iterator over the rest."""
     frames, *views = (_filled(first, chunks, count) for first, chunks in zip(firsts, others, strict=True))
-    goal = None if recipe.goal is None else recipe.goal.picture(frames)
-    if goal is not None and recipe.resize and recipe.checkpoint.frame_size is not None:
-        (goal,) = resize_frames(goal[np.newaxis], recipe.checkpoint.frame_size)
+    goal = None if recipe.goal is None else recipe.resized(recipe.goal.picture(frames)[np.newaxis])[0]
     return Trajectory(frames=frames, task=task, views=tuple(views), goal=goal)
 
 

@@ -189,7 +189,7 @@ class TaskOverride:
 
 
 class Dataset(ABC):
-    """Episodes on disk. Opening a dataset reads its tables, but no frames.
+    """Episodes on disk. Opening a dataset reads its tables, but no frames. ``open_dataset`` gives the caller's wishes.
 
     kind: layout, for example ``LeRobot v3.0``
     root: default folder for labels

@@ -149,7 +149,6 @@ class EpisodeFiles(CountedDataset):
     root: folder to which the names are relative
     tasks: task by episode name; None: no task
     table: task table, or the folder, for messages
-    task, corrections: from the caller
     """
 
     def __init__(

@@ -126,11 +126,7 @@ def label_prefix(path: Path) -> str:
 
 
 class Hdf5Dataset(CountedDataset):
-    """The demonstrations in one file.
-
-    task: task from the caller
-    corrections: corrections from the caller; without an orientation, LIBERO cameras are turned
-    """
+    """The demonstrations in one file. LIBERO's cameras are turned, unless the caller says otherwise."""
 
     def __init__(
         self, file: Path, *, task: TaskOverride = TaskOverride(), corrections: AskedCorrections = AskedCorrections()

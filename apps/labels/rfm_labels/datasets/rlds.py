@@ -67,11 +67,7 @@ class _Record:
 
 
 class RldsDataset(CountedDataset):
-    """The episodes in all splits.
-
-    task: task from the caller
-    corrections: corrections from the caller
-    """
+    """The episodes in all splits."""
 
     kind = "RLDS"
 
