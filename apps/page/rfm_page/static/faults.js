@@ -4,7 +4,7 @@
 import { ServerError } from "./api.js";
 
 const BY_ITSELF = "Checking automatically.";
-const START = "rfm serve my_models --gateway-port 8100";
+const START = `rfm serve my_models --gateway-port ${location.port || 8100}`;
 const WITH_DATASET = `${START} --gateway-dataset my_dataset`;
 let triton = ""; // its URL
 
