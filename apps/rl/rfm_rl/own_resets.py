@@ -34,15 +34,14 @@ class CopiedObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
 def watched_resets(env: gymnasium.Env[Any, Any]) -> Iterator[list[Any]]:
     """Yield a list that grows with each reset during the context."""
     resets: list[Any] = []
-    owner: Any = env.unwrapped
-    reset = owner.reset
+    owner, reset = env.unwrapped, env.unwrapped.reset
     own = {name: method for name, method in vars(owner).items() if name == "reset"}  # else the method is the class's
 
     def watched(*args: Any, **options: Any) -> Any:
         resets.append(options)
         return reset(*args, **options)
 
-    owner.reset = watched
+    owner.reset = watched  # type: ignore[method-assign]
     try:
         yield resets
     finally:
