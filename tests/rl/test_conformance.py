@@ -477,6 +477,7 @@ WARNED = (
     "reset: expected the end of the episode before it, got one after 2 steps, whose reward is lost; put the time limit "
     "inside the wrapper: RewardModelWrapper(TimeLimit(env, steps), ...), or gymnasium.make(..., max_episode_steps=steps)"
 )
+REFUSED = "reset: expected the end of an episode before it, where mode 'final' pays, got one after 2 steps, .*TimeLimit"
 
 
 def cut(door: Door) -> None:
@@ -490,10 +491,37 @@ def of_first(door: Door) -> str:
     return "envs[0]: " if door.asks_once else ""
 
 
+@at_each_door
+def test_final_refuses_the_second_early_reset_in_a_row(
+    recorder: Recorder, warnings: Callable[[], list[str]], kind: type[Door]
+) -> None:
+    """It says so in the log at the first, which might be deliberate. A caller who means it may go on."""
+    with opened(kind, recorder, [CodedEnv()], options(mode="final")) as door:
+        cut(door)
+        assert warnings() == []
+        cut(door)
+        assert warnings() == [of_first(door) + WARNED]
+        with pytest.raises(ValueError, match=rf"^(envs\[0\]: )?{REFUSED}"):
+            cut(door)
+        cut(door)
+    assert warnings() == [of_first(door) + WARNED]
+
+
+@at_each_door
+def test_an_end_between_early_resets_allows_them(
+    recorder: Recorder, warnings: Callable[[], list[str]], kind: type[Door]
+) -> None:
+    """Evaluations reset early; of a vector, one environment may end in time."""
+    envs = [CodedEnv(0, (3,)), CodedEnv(1, (2,))] if kind.asks_once else [CodedEnv(0, (3, 2))]
+    with opened(kind, recorder, envs, options(mode="final")) as door:
+        for _ in range(4):
+            cut(door)
+    assert warnings() == [of_first(door) + WARNED]
+
+
 CUT: dict[str, tuple[dict[str, Any], bool]] = {  # options, and whether the last step's reward is lost
     "each step is paid": ({"mode": "delta"}, False),
     "every fourth step is scored": ({"mode": "delta", "every": 4}, True),
-    "final": ({"mode": "final"}, True),
     "final, which scores each step for the bonus": ({"mode": "final", "success_bonus": 1.0}, True),
 }
 
@@ -528,6 +556,12 @@ def test_resets_after_an_error_are_silent(
                 door.step()
             door.reset()
     assert warnings() == []
+    with opened(kind, recorder, [CodedEnv()], options(mode="final", success_bonus=1.0)) as door:
+        for _ in range(3):
+            door.reset()
+            recorder.server.failing = len(recorder.calls)
+            with pytest.raises(ServerUnavailableError):
+                door.step()
 
 
 REFUSED_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
 from rfm_client import InvalidSampleError, RewardClient, as_array
+from rfm_client.options import InvalidValueError
 from rfm_rl.rewards import RewardedEpisode, RewardOptions
 
 ClientSource: TypeAlias = RewardClient | Callable[[], RewardClient]
@@ -65,6 +66,7 @@ class RewardedEnvs:
         self._remedy, self._final, self._is_only = remedy, final, is_only
         self._returning_copies = set(range(len(tasks))) if returns_copies else set()  # environments by number
         self._made: RewardClient | None = None
+        self._has_dropped = False  # the last reset dropped a reward, and no episode has ended since
         self._has_warned = False
 
     @property
@@ -73,14 +75,15 @@ class RewardedEnvs:
         return np.array([episode.succeeded for _, episode in sorted(self.episodes.items())], np.bool_)
 
     def check_reset(self, mask: Mask) -> None:
-        """Warn once if a reset drops the reward of unended episodes. Call this before the reset."""
+        """Warn once if a reset drops the reward of unended episodes. Call this before the reset.
+
+        Raises ValueError in mode ``final`` for the second such reset in a row: episodes that end outside the wrapper
+        would never be paid. An end or an error between the resets allows the second.
+        """
         running = [self.episodes[index] for index in _numbers(mask & self._whole)]
         unpaid = next((episode for episode in running if episode.is_unpaid), None)
-        if unpaid is not None and not self._has_warned:
-            self._has_warned = True
-            where = "reset" if unpaid.index is None else f"envs[{unpaid.index}]: reset"
-            got = f"one after {unpaid.steps.step} steps, whose reward is lost"
-            logger.warning("%s: expected the end of the episode before it, got %s; %s", where, got, _INSIDE)
+        if unpaid is not None:
+            self._check_dropped(unpaid)
         self._resetting, self._kept = mask, self._whole & ~mask
         self._whole = np.zeros_like(mask)
 
@@ -149,6 +152,17 @@ class RewardedEnvs:
         if self._made is not None:
             self._made.close()
 
+    def _check_dropped(self, unpaid: RewardedEpisode) -> None:
+        where = "reset" if unpaid.index is None else f"envs[{unpaid.index}]: reset"
+        got = f"one after {unpaid.steps.step} steps, whose reward is lost"
+        self._has_dropped = not self._has_dropped  # a third reset may go on
+        if not self._has_dropped and self._options.mode == "final":
+            expected = "the end of an episode before it, where mode 'final' pays"
+            raise InvalidValueError.at(where, expected, f"{got}, for the second time in a row", _INSIDE)
+        if not self._has_warned:
+            self._has_warned = True
+            logger.warning("%s: expected the end of the episode before it, got %s; %s", where, got, _INSIDE)
+
     def _begin(self, mask: Mask, first: Frames, last: Mapping[int, Any]) -> list[RewardedEpisode]:
         """Begin an episode in each masked environment. last: copies of the last frames of the episodes before"""
         fresh = []
@@ -183,11 +197,14 @@ class RewardedEnvs:
 
         episodes: True for an episode whose newest frame is its last
         """
+        has_dropped, self._has_dropped = self._has_dropped, False  # after an error, a reset may drop a reward
         try:
             self._ask(episodes)
+            self._has_dropped = has_dropped
         finally:
             for episode in (episode for episode, ends in episodes.items() if ends or episode.succeeded):
                 episode.end()
+                self._has_dropped = False
 
     def _ask(self, episodes: Mapping[RewardedEpisode, bool]) -> None:
         awaited = []

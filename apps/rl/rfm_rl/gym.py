@@ -27,7 +27,8 @@ model's summed rewards. These wrappers do not see an end by ``terminate_on_succe
 sum there.
 
 A time limit belongs inside the wrapper, as ``gymnasium.make`` puts it. If a reset drops the reward of an unended
-episode, a warning is logged once.
+episode, a warning is logged once. In mode ``final``, a second such reset in a row, with no episode end and no error in
+between, raises ValueError.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         self._has_statistics = env.has_wrapper_attr(RETURNS)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Reset the environment and score its first frame. Cancel open requests. Raises RewardError."""
+        """Reset the environment and score its first frame. Cancel open requests. Raises RewardError, ValueError."""
         self._envs.check_reset(_ALL)
         observation, info = self.env.reset(seed=seed, options=options)
         self._envs.tasks[0] = self._task if isinstance(self._task, str) else self._task(info)

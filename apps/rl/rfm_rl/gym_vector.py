@@ -86,7 +86,7 @@ class RewardModelVectorWrapper(VectorWrapper):
 
         options: passed on; ``reset_mask``, only with DISABLED, may be an array, a list or a tensor, bool [num_envs]
 
-        Raises RewardError; ValueError for a wrong mask.
+        Raises RewardError; ValueError for a wrong mask, and as RewardModelWrapper.
         """
         reset_mask, options = self._masked(options)
         self._check_can_reset()
