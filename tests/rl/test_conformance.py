@@ -19,7 +19,6 @@ from environments import MAX_FRAMES, assert_close, progress
 from reward_doors import (
     DOORS,
     ENDED_BY_SUCCESS,
-    SAME_STEP,
     TASKS,
     VECTORS,
     Door,
@@ -72,11 +71,6 @@ def options(**more: Any) -> RewardOptions:
 
 def opened(kind: type[Door], client: RewardClient, envs: Sequence[gym.Env[Any, Any]], asked: RewardOptions) -> Door:
     return kind(makers_of(envs), client, asked)
-
-
-def copying(kind: type[Door], envs: Sequence[gym.Env[Any, Any]]) -> Sequence[gym.Env[Any, Any]]:
-    """Return the environments, wrapped for a door that resets them in the step that ends an episode."""
-    return [CopiedObservation(env) for env in envs] if kind.resets == SAME_STEP else envs
 
 
 def changes(factor: float, values: Sequence[float] = PROGRESS) -> list[float]:
@@ -296,7 +290,7 @@ def test_each_question_has_the_frames_of_its_own_episode(
     """Also after a failed call, whose frame is part of the episode. A step after an episode's end is refused."""
     envs = [CodedEnv(number, lengths, reuse=reuse) for number, lengths in enumerate(LENGTHS)]
     envs = envs if kind.asks_once else envs[:1]
-    with Recorder(failing) as client, opened(kind, client, copying(kind, envs), options(frames_from=source)) as door:
+    with Recorder(failing) as client, opened(kind, client, envs, options(frames_from=source)) as door:
         for call in range(CALLS):
             with pytest.raises(ServerUnavailableError) if call == failing else nullcontext():
                 go_on(door, envs) if call else door.reset()
@@ -357,22 +351,20 @@ def test_a_vector_goes_on_after_a_reset_of_the_environment_that_lost_a_frame(rec
 
 @at_each_door
 def test_an_episode_that_ends_where_the_next_begins_is_paid(judge: Recorder, kind: type[Door]) -> None:
-    with opened(kind, judge, copying(kind, [ReturningEnv()]), options()) as door:
+    with opened(kind, judge, [ReturningEnv()], options()) as door:
         ended = [episode for episode in played(door, 8)[0] if episode.terminated]
     assert len(ended) >= 2
     for episode in ended:
         assert episode.rewards == pytest.approx([PROGRESS[1], PROGRESS[0]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("since", [0, 1])
-@pytest.mark.parametrize("kind", [pytest.param(InProcesses, marks=pytest.mark.slow), VECTORS["SAME_STEP"]])
-def test_an_environment_that_may_have_drawn_over_its_last_frame_is_refused(
-    judge: Recorder, kind: type[Door], since: int
-) -> None:
+def test_a_process_that_may_have_drawn_over_a_last_frame_is_refused(judge: Recorder, since: int) -> None:
     """Until an episode's last frame differs from the next one's first."""
     expected = r"^final_obs\[0\]: expected the last frame .*, got the first frame .*rfm_rl\.CopiedObservation"
     refused = pytest.raises(InvalidSampleError, match=expected) if since == 0 else nullcontext()
-    with opened(kind, judge, [ReturningEnv(since)], options()) as door, refused:
+    with opened(InProcesses, judge, [ReturningEnv(since)], options()) as door, refused:
         assert len(played(door, 4)[0]) == 3
 
 
@@ -576,6 +568,10 @@ REFUSED_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
     "two rules": (
         {"success": SuccessRule(0.9), "success_bonus": 1.0, "terminate_on_success": SuccessRule(0.8)},
         "^success: expected None or the rule of terminate_on_success, ",
+    ),
+    "an end that is not awaited": (
+        {"mode": "final", "blocking": False, "await_last": False},
+        "^await_last: expected True with mode 'final'",
     ),
     "fuse": ({"fuse": "sum"}, "^fuse: expected one of mean, min, max, got 'sum'$"),
     "orient": ({"orient": "upside-down"}, "^orient: expected one of none, rotate180, .*, got 'upside-down'$"),

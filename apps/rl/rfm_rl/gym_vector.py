@@ -20,7 +20,7 @@ from rfm_client import InvalidSampleError, as_array
 from rfm_client.options import InvalidValueError, require
 from rfm_rl.envs import INFO, ClientSource, Mask, RewardedEnvs
 from rfm_rl.gym import DEFAULTS, check_frame_source, check_kind, tasks_of
-from rfm_rl.own_resets import HAS_RESET, check_renders_its_end, watched_resets
+from rfm_rl.own_resets import HAS_RESET, check_renders_its_end, copied_steps, watched_resets
 from rfm_rl.rewards import Info, RewardOptions, correct_statistics
 
 _INSTEAD_OF_SAME_STEP = "make the vector with autoreset_mode=AutoresetMode.NEXT_STEP"
@@ -65,16 +65,16 @@ class RewardModelVectorWrapper(VectorWrapper):
         autoreset_mode = _checked_autoreset_mode(env, options)
         tasks = tasks_of(task, env.num_envs)
         super().__init__(env)  # after the checks: a refused wrapper must not close the environments when collected
+        here = list(env.unwrapped.envs) if isinstance(env.unwrapped, SyncVectorEnv) else []
         is_mani_skill = type(env).__module__.startswith("mani_skill.")  # which keeps copies of last frames
-        copies = _of_each(env, "has_wrapper_attr", "copies_observations")
-        has_copies = is_mani_skill or (bool(copies) and all(copies))
+        in_processes = _of_each(env, "has_wrapper_attr", "copies_observations")
+        has_copies = bool(here) or is_mani_skill or (bool(in_processes) and all(in_processes))
         self._envs = RewardedEnvs(
             client, options, tasks, remedy=_REMEDY, final="final_obs[{}]", returns_copies=has_copies
         )
         self._options = options
         self._autoreset_mode = autoreset_mode
-        vector = env.unwrapped
-        self._watched = list(vector.envs) if isinstance(vector, SyncVectorEnv) and options.renders else []
+        self._here = here if options.renders or autoreset_mode is AutoresetMode.SAME_STEP else []  # in this process
 
     @property
     def autoreset_mode(self) -> AutoresetMode:
@@ -84,14 +84,15 @@ class RewardModelVectorWrapper(VectorWrapper):
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environments, or those in ``reset_mask``, and score their first frames.
 
-        options: passed on; ``reset_mask``, only with DISABLED, may be an array, a list or a tensor, bool [num_envs]
+        options: passed on; ``reset_mask`` may be an array, a list or a tensor, bool [num_envs]
 
-        Raises RewardError; ValueError for a wrong mask, and as RewardModelWrapper.
+        Raises RewardError; ValueError for a wrong mask, a vector that does not read it, and as RewardModelWrapper.
         """
         reset_mask, options = self._masked(options)
-        self._check_can_reset()
+        self._check_can_reset(self._resetting & reset_mask)
         self._envs.check_reset(reset_mask)
         observations, infos = self.env.reset(seed=seed, options=options)
+        self._check_was_masked(options)
         self._envs.begin(partial(self._frame, self._shown(observations)))
         return observations, self._with_scores(infos, reset_mask)
 
@@ -100,7 +101,8 @@ class RewardModelVectorWrapper(VectorWrapper):
         resetting = self._resetting
         self._envs.check_step(resetting)
         with ExitStack() as stack:
-            watched = [stack.enter_context(watched_resets(env)) for env in self._watched]
+            watch = watched_resets if self._options.renders else copied_steps
+            watched = [stack.enter_context(watch(env)) for env in self._here]
             observations, env_rewards, terminations, truncations, infos = self.env.step(actions)
         terminated, truncated = (as_array(each).astype(np.bool_) for each in (terminations, truncations))
         ended, resets_at_once = terminated | truncated, self._autoreset_mode is AutoresetMode.SAME_STEP
@@ -133,13 +135,20 @@ class RewardModelVectorWrapper(VectorWrapper):
         mask = as_array(options[_RESET_MASK])
         is_mask = mask.dtype == np.bool_ and mask.shape == (self.num_envs,)
         require(_RESET_MASK, is_mask, f"bool [{self.num_envs}]", f"{mask.dtype} {list(mask.shape)}")
-        got = f"one of mode {self._autoreset_mode.name}; reset all environments"
-        require(_RESET_MASK, self._autoreset_mode is AutoresetMode.DISABLED, "a vector that resets none itself", got)
         return mask, {**options, _RESET_MASK: mask}
 
-    def _check_can_reset(self) -> None:
-        """Raise ValueError where Gymnasium's workers (1.4) would reset again in the next step, despite this reset."""
-        vector, twice = self.unwrapped, self._resetting
+    def _check_was_masked(self, options: Info | None) -> None:
+        """Raise ValueError if a vector with its own reset has not read the mask: it may have reset all."""
+        is_left = options is not None and _RESET_MASK in options and self._autoreset_mode is not AutoresetMode.DISABLED
+        got = f"{type(self.unwrapped).__name__}, which left it there; reset all environments"
+        require(_RESET_MASK, not is_left, "a vector that takes it out of the options", got)
+
+    def _check_can_reset(self, twice: Mask) -> None:
+        """Raise ValueError where Gymnasium's workers (1.4) would reset again in the next step, despite this reset.
+
+        twice: environments that are due to reset in the next step
+        """
+        vector = self.unwrapped
         if twice.any() and isinstance(vector, AsyncVectorEnv) and not vector.shared_memory:
             got = f"the environments {np.flatnonzero(twice).tolist()}, which would reset once more in the next step"
             remedy = "take a step before it, or make the AsyncVectorEnv with shared_memory=True"

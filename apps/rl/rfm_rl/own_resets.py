@@ -18,7 +18,7 @@ HAS_RESET = "final_info"  # in info from LeRobot's environments, whose observati
 
 
 class CopiedObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
-    """Copies the environment's observations, for vectors that reset it in the step that ends its episode.
+    """Copies the environment's observations, for vectors that reset it in another process.
 
     Such a vector keeps the array of an episode's last frame and resets the environment, which may draw over it.
     """
@@ -34,18 +34,37 @@ class CopiedObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
 def watched_resets(env: gymnasium.Env[Any, Any]) -> Iterator[list[Any]]:
     """Yield a list that grows with each reset during the context."""
     resets: list[Any] = []
-    owner, reset = env.unwrapped, env.unwrapped.reset
-    own = {name: method for name, method in vars(owner).items() if name == "reset"}  # else the method is the class's
+    reset = env.unwrapped.reset
 
     def watched(*args: Any, **options: Any) -> Any:
         resets.append(options)
         return reset(*args, **options)
 
-    owner.reset = watched  # type: ignore[method-assign]
-    try:
+    with _replaced(env.unwrapped, "reset", watched):
         yield resets
+
+
+@contextmanager
+def copied_steps(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
+    """Let steps return copies of their observations during the context."""
+    step = env.step
+
+    def copied(action: Any) -> Any:
+        observation, *rest = step(action)
+        return deepcopy(observation), *rest
+
+    with _replaced(env, "step", copied):
+        yield
+
+
+@contextmanager
+def _replaced(owner: Any, name: str, method: Any) -> Iterator[None]:
+    own = {name: vars(owner)[name]} if name in vars(owner) else {}  # else the method is the class's
+    setattr(owner, name, method)
+    try:
+        yield
     finally:
-        del owner.reset
+        delattr(owner, name)
         vars(owner).update(own)
 
 

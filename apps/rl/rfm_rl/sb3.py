@@ -11,6 +11,7 @@ frame is then in the info: ``terminal_observation``, or the frame from RenderedF
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import gymnasium
@@ -20,7 +21,7 @@ from rfm_client import InvalidSampleError
 from rfm_client.options import require
 from rfm_rl.envs import INFO, ClientSource, RewardedEnvs
 from rfm_rl.gym import DEFAULTS, check_frame_source, tasks_of
-from rfm_rl.own_resets import HAS_RESET, CopiedObservation, check_renders_its_end, watched_resets
+from rfm_rl.own_resets import HAS_RESET, CopiedObservation, check_renders_its_end, copied_steps, watched_resets
 from rfm_rl.rewards import RELABELS, Info, RewardOptions, refuse_relabelling, with_statistics
 
 try:
@@ -98,8 +99,11 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         require("venv", unwrap_vec_normalize(venv) is None, expected, instead)
         tasks = tasks_of(task, venv.num_envs)
         final = "infos[{}]['terminal_observation']"
+        is_here = isinstance(venv.unwrapped, DummyVecEnv) and not options.renders
+        self._here = list(venv.unwrapped.envs) if is_here else []  # environments in this process
         may_look = isinstance(venv.unwrapped, (DummyVecEnv, SubprocVecEnv))
-        copies = options.renders or (may_look and all(venv.env_is_wrapped(CopiedObservation)))
+        in_processes = may_look and all(venv.env_is_wrapped(CopiedObservation))
+        copies = options.renders or is_here or in_processes
         self._envs = RewardedEnvs(client, options, tasks, remedy="call reset", final=final, returns_copies=copies)
         self._reward_options = options
         super().__init__(venv)  # which reads attributes
@@ -120,7 +124,10 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
 
     def step_wait(self) -> tuple[Any, Any, Any, list[Info]]:
         """End the step; return the model's rewards, float32 [num_envs]. Raises RewardError."""
-        observations, env_rewards, dones, step_infos = self.venv.step_wait()
+        with ExitStack() as stack:
+            for env in self._here:
+                stack.enter_context(copied_steps(env))
+            observations, env_rewards, dones, step_infos = self.venv.step_wait()
         infos = [dict(info) for info in step_infos]  # a list in one ``VecEnv``, a tuple in another
         ended = np.flatnonzero(dones).tolist()
         for index in ended:
