@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import copy
 import pickle
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,12 @@ import pytest
 import torch
 
 import fake_lerobot
-from coded_env import Code, CodeReader, Recorder, frame_of
+from coded_env import Code, CodeReader, Recorder
 from environments import MODEL
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,
-    ModelInfo,
+    ProgressResult,
     RewardClient,
     ServerError,
 )
@@ -28,6 +27,7 @@ from servers import Served
 fake_lerobot.provide()
 
 from lerobot_reward_rfm import RfmRewardConfig, RfmRewardModel  # noqa: E402
+from lerobot_reward_rfm.modeling_rfm import check_clear  # noqa: E402
 
 KEY, TASK = "observation.images.top", "stack the cups"
 PIXELS = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (2, 5, 3, 48, 64), np.uint8))  # [B, T, 3, H, W]
@@ -170,28 +170,14 @@ def test_the_reward_of_success_is_one_or_zero(success: float, reward: float | No
             assert model.predict_progress(batch).success_probability is None
 
 
-CODED = torch.from_numpy(np.array([[frame_of(sample, 0, step) for step in range(3)] for sample in range(2)]))
-
-
-class Unclear(CodeReader):
-    """A server whose answer about the third frame of the second sample is unclear."""
-
-    async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
-        return replace(await super().model_info(model, timeout_s), more_scores=("unclear",))
-
-    def scores(self, codes: list[Code]) -> dict[str, Any]:
-        return {"unclear": [code == (1, 0, 2) for code in codes]}
-
-
 def test_an_answer_without_a_clear_score_is_an_error() -> None:
-    with Recorder(server=Unclear()) as client:
-        model = RfmRewardModel(RfmRewardConfig(sampling="all"), client=client)
-        for ask, where in (
-            (model.compute_reward, "sample 1 of the batch"),
-            (model.predict_progress, "frame 2 of sample 1"),
-        ):
-            with pytest.raises(InferenceFailedError, match=f"^{where}: the model's written answer states no single"):
-                ask({KEY: CODED, "task": TASK})
+    score = np.array([0.5, 0.5], np.float32)
+    result = ProgressResult(progress=score, success=score, unclear=np.array([False, True]))
+    check_clear(result, 0, "sample 3 of the batch")
+    with pytest.raises(
+        InferenceFailedError, match=r"^sample 3 of the batch: the model's written answer states no single"
+    ):
+        check_clear(result, 1, "sample 3 of the batch")
 
 
 def test_a_copy_of_a_model_asks_with_a_client_of_its_own(served: Served) -> None:
@@ -219,7 +205,7 @@ def test_a_model_with_a_client_of_yours_has_no_copies(recorder: Recorder) -> Non
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "no address": ({"url": " "}, "^url: expected the server's address"),
     "a key of no camera": ({"image_key": "pixels"}, "^image_key: expected observation.image or"),
-    "a rule": ({"sampling": "newest"}, "^sampling: expected "),
+    "a rule": ({"sampling": "newest"}, "^sampling: expected None or one of linspace_trunc"),
     "a turn": ({"orient": "up"}, "^orient: expected one of none, rotate180"),
     "an output": (
         {"reward_output": "delta"},

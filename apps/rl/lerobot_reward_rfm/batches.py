@@ -42,8 +42,7 @@ def trajectory_of(
             f"sample {index} of the batch: {error}. Give images as the dataset or the camera has them, "
             "before any normalization"
         ) from error
-    (correction,) = config.scoring.corrections
-    return replace(trajectory, frames=correction.applied(trajectory.positions))
+    return replace(trajectory, frames=config.correction.applied(trajectory.positions))
 
 
 def images_of(batch: Mapping[str, Any], key: str) -> Any:

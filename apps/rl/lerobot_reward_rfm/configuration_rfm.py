@@ -5,14 +5,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import get_args
 
 from lerobot.configs.rewards import RewardModelConfig
 
 from rfm_client import RewardClient
-from rfm_client.episodes import EpisodeOptions, SuccessRule
-from rfm_client.options import checked_finite, require
+from rfm_client.episodes import SuccessRule
+from rfm_client.frames import Correction, Orientation, Rule
+from rfm_client.options import checked_count, checked_finite, require
 from rfm_client.serving import DEFAULT_MODEL
+
+OUTPUTS = ("progress", "success", "remaining_s")
 
 
 @RewardModelConfig.register_subclass("rfm")
@@ -59,20 +62,21 @@ class RfmRewardConfig(RewardModelConfig):
         require("url", bool(self.url.split()), "the server's address, such as grpc://localhost:8001", repr(self.url))
         is_camera = self.image_key == "observation.image" or self.image_key.startswith("observation.images.")
         require("image_key", is_camera, "observation.image or observation.images.<camera>", repr(self.image_key))
-        outputs = ("progress", "success", "remaining_s")
+        rules, turns = get_args(Rule), get_args(Orientation)
+        require("sampling", self.sampling in (None, *rules), f"None or one of {', '.join(rules)}", repr(self.sampling))
+        require("orient", self.orient in turns, f"one of {', '.join(turns)}", repr(self.orient))
         require(
-            "reward_output", self.reward_output in outputs, f"one of {', '.join(outputs)}", repr(self.reward_output)
+            "reward_output", self.reward_output in OUTPUTS, f"one of {', '.join(OUTPUTS)}", repr(self.reward_output)
         )
         is_share = 0 <= checked_finite("success_threshold", self.success_threshold) <= 1
         require("success_threshold", is_share, "a probability, 0 to 1", self.success_threshold)
-        _ = self.scoring  # raises ValueError
+        if self.frames is not None:
+            checked_count("frames", self.frames)
 
     @property
-    def scoring(self) -> EpisodeOptions:
-        """How each sample is scored, as an episode. Raises ValueError."""
-        given: dict[str, Any] = {name: getattr(self, name) for name in ("sampling", "frames", "orient", "resize")}
-        given["score"] = "remaining_s" if self.reward_output == "remaining_s" else "progress"
-        return EpisodeOptions(**given, success=SuccessRule(self.success_threshold))
+    def correction(self) -> Correction:
+        """How to make the camera's frames upright."""
+        return Correction(self.orient)  # type: ignore[arg-type]  # checked above; LeRobot's parser knows no Literal
 
     def connect(self) -> RewardClient:
         """Return a client for the server. Raises ValueError for contradictory options, OSError for a missing file."""

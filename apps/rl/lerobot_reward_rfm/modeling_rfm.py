@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, islice
 from typing import Any, cast
 
 import numpy as np
@@ -15,10 +15,20 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from torch import Tensor
 
 from lerobot_reward_rfm.batches import padding_of, trajectories_of
-from lerobot_reward_rfm.configuration_rfm import RfmRewardConfig
-from rfm_client import Float32Array, InferenceFailedError, RewardClient, Trajectory
-from rfm_client.episodes import Episode
+from lerobot_reward_rfm.configuration_rfm import OUTPUTS, RfmRewardConfig
+from rfm_client import (
+    Float32Array,
+    InferenceFailedError,
+    ModelInfo,
+    ProgressResult,
+    ProgressSample,
+    RewardClient,
+    Trajectory,
+)
+from rfm_client.frames import Sampling
 from rfm_client.options import require
+
+AT_A_TIME = 32  # samples: each copies its frames, so all prefixes of an episode at once would fill memory
 
 
 @dataclass(frozen=True)
@@ -83,17 +93,16 @@ class RfmRewardModel(PreTrainedRewardModel):
         The Gymnasium wrappers and labels give the same reward for the same frames. Raises RewardError, never returns a
         number instead; ValueError for a ``reward_output`` that the checkpoint does not predict.
         """
+        newest = newest_scores(self.client, trajectories_of(batch, self.config), self.config)
         output = self.config.reward_output
-        with ExitStack() as stack:
-            trajectories = enumerate(trajectories_of(batch, self.config))
-            scores = self.client.score_episodes([stack.enter_context(self._episode(*each)) for each in trajectories])
-        for index, score in enumerate(scores):
-            check_clear(score.unclear, f"sample {index} of the batch")
-        if output != "success":
-            return self._tensor(batch, [score.value(cast(Any, output)) for score in scores])
-        is_predicted = not any(np.isnan(score.success) for score in scores)
-        require("reward_output", is_predicted, "progress", "success, which the checkpoint does not predict")
-        return self._tensor(batch, [score.succeeded for score in scores])
+        columns = {name: [each.arrays.get(name, [np.nan])[0] for each in newest] for name in OUTPUTS}
+        predicted = [name for name, scores in columns.items() if not np.isnan(scores).any()]
+        got = f"{output}, which the checkpoint does not predict"
+        require("reward_output", output in predicted, " or ".join(predicted) or "a checkpoint that scores frames", got)
+        scores = np.array(columns[output])
+        if output == "success":
+            return self._tensor(batch, scores >= self.config.success_threshold)
+        return self._tensor(batch, -scores if output == "remaining_s" else scores)
 
     def predict_progress(self, batch: Mapping[str, Any]) -> RfmPrediction:
         """Return scores for all frames. No score uses later frames, so the last equals ``compute_reward``'s.
@@ -101,32 +110,12 @@ class RfmRewardModel(PreTrainedRewardModel):
         The server scores B times T samples. Raises RewardError.
         """
         trajectories = trajectories_of(batch, self.config)
-        rule = self.config.scoring.sampling_for(self.client.model_info(frames=True))
-        results = [self.client.curve(each, rule, resize=self.config.resize) for each in trajectories]
-        for index, result in enumerate(results):
-            for frame in np.flatnonzero(result.arrays.get("unclear", ())):
-                check_clear(True, f"frame {frame} of sample {index}")
+        results = scores_of_all_frames(self.client, trajectories, self.config)
         pads = padding_of(batch, self.config.image_key)
         progress = spread([result.progress for result in results], pads)
         success = spread([result.success for result in results], pads)
         knows = not np.isnan(success).any()
         return RfmPrediction(self._tensor(batch, progress), self._tensor(batch, success) if knows else None)
-
-    def _episode(self, index: int, trajectory: Trajectory) -> Episode:
-        """Return an episode with a sample's frames. index: the sample's, for errors"""
-        options = self.config.scoring
-        episode = self.client.episode(
-            trajectory.task,
-            env=index,
-            sampling=options.sampling,
-            frames=options.frames,
-            resize=options.resize,
-            success=options.success,
-            score=options.score,
-        )
-        for frame in trajectory.positions:
-            episode.keep(frame)
-        return episode
 
     def _tensor(self, batch: Mapping[str, Any], values: Sequence[float] | npt.NDArray[Any]) -> Tensor:
         device = getattr(batch[self.config.image_key], "device", None)
@@ -145,7 +134,58 @@ def spread(scores: Sequence[Float32Array], pads: npt.NDArray[np.bool_] | None) -
     return np.stack([row[slots] for row, slots in zip(scores, real, strict=True)])
 
 
-def check_clear(is_unclear: bool, where: str) -> None:
+def rule_of(info: ModelInfo, config: RfmRewardConfig) -> Sampling:
+    """Return the sampling rule. Raises ValueError if the rule needs a number and has none.
+
+    Raises InvalidSampleError for a checkpoint that cannot score while an episode runs.
+    """
+    info.check_scores_prefixes()
+    rule = cast(Any, config.sampling)
+    return Sampling.of(rule, config.frames, info.max_frames, trained_padding=info.trained_padding)
+
+
+def newest_scores(
+    client: RewardClient, trajectories: Sequence[Trajectory], config: RfmRewardConfig
+) -> list[ProgressResult]:
+    """Return the newest frame's scores for each trajectory, [1], from few requests. Raises RewardError."""
+    rule = rule_of(client.model_info(frames=True), config)
+    prefixes = [rule.prefix(trajectory.num_frames - 1) for trajectory in trajectories]
+    samples = [
+        ProgressSample(replace(trajectory, frames=cast(Any, trajectory.frames)[prefix.indices]))
+        for trajectory, prefix in zip(trajectories, prefixes, strict=True)
+    ]
+    results = zip(evaluated(client, samples, config), prefixes, strict=True)
+    newest = [result.at(slice(prefix.read, prefix.read + 1)) for result, prefix in results]
+    for index, result in enumerate(newest):
+        check_clear(result, 0, f"sample {index} of the batch")
+    return newest
+
+
+def scores_of_all_frames(
+    client: RewardClient, trajectories: Sequence[Trajectory], config: RfmRewardConfig
+) -> list[ProgressResult]:
+    """Return scores for every frame of each trajectory, [T], as ``newest_scores`` would at that frame.
+
+    Costs one sample per frame. Raises RewardError.
+    """
+    rule = rule_of(client.model_info(frames=True), config)
+    results = iter(evaluated(client, chain.from_iterable(map(rule.samples, trajectories)), config))
+    joined = [rule.joined(list(islice(results, trajectory.num_frames))) for trajectory in trajectories]
+    for index, result in enumerate(joined):
+        for frame in range(len(result.progress)):
+            check_clear(result, frame, f"frame {frame} of sample {index}")
+    return joined
+
+
+def evaluated(client: RewardClient, samples: Iterable[ProgressSample], config: RfmRewardConfig) -> list[ProgressResult]:
+    """Return results in sample order, with the frames of only a few samples in memory. Raises RewardError."""
+    waiting, results = iter(samples), list[ProgressResult]()
+    while some := list(islice(waiting, AT_A_TIME)):
+        results += cast(list[ProgressResult], client.evaluate(some, resize=config.resize))
+    return results
+
+
+def check_clear(result: ProgressResult, slot: int, where: str) -> None:
     """Raise InferenceFailedError where a model that answers in words gave no single score."""
-    if is_unclear:
+    if result.unclear is not None and result.unclear[slot]:
         raise InferenceFailedError(f"{where}: the model's written answer states no single score; no reward was made up")
