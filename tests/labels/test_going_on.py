@@ -15,7 +15,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from pyarrow import parquet
 
 import labelling
 from labelling import FEW, LEROBOT, BrightnessScorer, Notes, PickyScorer
@@ -163,14 +165,33 @@ def test_parts_may_be_behind_a_url(output: Path, undisturbed: list[bytes]) -> No
     assert not (output / ".rfm_parts").exists()
 
 
-def test_label_files_of_which_the_second_is_not_written_change_no_file(
-    output: Path, monkeypatch: pytest.MonkeyPatch
+SPOILT: dict[str, Callable[[Any], Any]] = {
+    "a value": lambda table: table.set_column(3, table.schema.field(3), [np.zeros(len(table), np.float32)]),
+    "fewer rows": lambda table: table.slice(1),
+    "no metadata": lambda table: table.replace_schema_metadata({}),
+}
+
+
+@pytest.mark.parametrize("spoil", [*SPOILT.values(), None], ids=[*SPOILT, "the second of both is not written"])
+def test_label_files_that_are_not_written_or_read_back_otherwise_change_no_file(
+    output: Path, monkeypatch: pytest.MonkeyPatch, spoil: Callable[[Any], Any] | None
 ) -> None:
     options = LabelOptions(output=output, limit=1, **FEW)
     label(open_dataset(ROOT), BrightnessScorer(), options)
     before = [(output / name).stat().st_ino for name in FILES]
-    full_disk(monkeypatch, after=1)
-    with pytest.raises(OSError, match="No space left on device: make"):
+    write = parquet.write_table
+
+    def spoilt(table: Any, file: Any, **more: Any) -> None:
+        assert spoil is not None
+        write(spoil(table) if "reward" not in str(table.column_names) else table, file, **more)
+
+    if spoil is None:
+        full_disk(monkeypatch, after=1)
+        message = "No space left on device: make"
+    else:
+        monkeypatch.setattr(parquet, "write_table", spoilt)
+        message = r"rfm_progress\.parquet: expected the labels that were written, read others: make"
+    with pytest.raises(OSError, match=message):
         label(open_dataset(ROOT), BrightnessScorer(), options)
     assert [(output / name).stat().st_ino for name in FILES] == before
     assert sorted(file.name for file in output.iterdir()) == [".rfm_parts", "reward_signals", "rfm_progress.parquet"]

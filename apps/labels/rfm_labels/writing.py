@@ -139,14 +139,17 @@ class Parts:
     def read_all(self, plan: Plan) -> Any:
         """Return a pyarrow Table with the rows for all items in the plan, in order, and the blank cameras as metadata.
 
-        Raises DatasetError if a part is missing or damaged, or has other columns than the first.
+        Raises DatasetError if a part is missing, damaged or out of order, or has other columns than the first.
         """
         import pyarrow as pa
 
         tables: list[Any] = []
         blank: dict[str, dict[int, int]] = {}
+        following = -1
         for item in plan.items:
-            table = self.read(item)
+            table, first = self.read(item), item.episode.first_index
+            require(item.episode.name, first > following, f"rows after {following}", first)
+            following = first + item.episode.num_frames - 1
             names, own = (tables or [table])[0].column_names, table.column_names
             require(item.episode.name, own == names, f"the columns {', '.join(names)}", ", ".join(own))
             for camera, highest in blank_from_metadata(table.schema.metadata).items():
@@ -291,13 +294,13 @@ def _descriptor(column: str, skipping: str | None) -> dict[str, Any]:
 
 
 def write_labels(labels: Any, plan: Plan, progress: Sequence[Path], signals: Sequence[Path], name: str) -> list[Path]:
-    """Write the labels to new files, then move them into place one by one. Return all paths.
+    """Write the labels to new files, read them back, then move them into place one by one. Return all paths.
 
     labels: table from ``Parts.read_all``
     progress, signals: files in each format
     name: reward name, in the signals' column names
 
-    Raises OSError if a write fails; existing files then stay unchanged.
+    Raises OSError if a write fails or a file reads back differently; existing files then stay unchanged.
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -310,9 +313,25 @@ def write_labels(labels: Any, plan: Plan, progress: Sequence[Path], signals: Seq
     for path, _ in forms:
         path.parent.mkdir(parents=True, exist_ok=True)
     with whole_files(*(path for path, _ in forms)) as files:
-        for file, (_, (named, metadata)) in zip(files, forms, strict=True):
+        for file, (path, (named, metadata)) in zip(files, forms, strict=True):
             own = labels.select([*IDENTITY, *named]).rename_columns([*IDENTITY, *named.values()])
             fields = [pa.field(field.name, field.type, nullable=False) for field in own.schema]
             table = own.cast(pa.schema(fields, metadata={**metadata, **shared}))
             parquet.write_table(table, file, row_group_size=_ROWS_AT_A_TIME)
+            if not _holds(file, table):
+                raise OSError(f"{path}: expected the labels that were written, read others")
     return [path for path, _ in forms]
+
+
+def _holds(file: Path, table: Any) -> bool:
+    """True if the file's rows, values and metadata equal the table's."""
+    from pyarrow import ArrowException, parquet
+
+    try:
+        read = parquet.ParquetFile(file).read()
+    except ArrowException:
+        return False
+    pairs = zip(read.columns, table.columns, strict=False)
+    return read.schema.equals(table.schema, check_metadata=True) and all(
+        np.array_equal(one.to_numpy(), other.to_numpy(), equal_nan=True) for one, other in pairs
+    )

@@ -245,7 +245,7 @@ def _video(info: Info, where: str, row: Mapping[str, Any], key: str) -> tuple[Pa
         return error
 
 
-def _place(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float]:
+def _place(info: Info, where: str, row: Mapping[str, Any], key: str) -> tuple[Path, float]:
     chunk, number, from_s, to_s = (row[f"videos/{key}/{name}"] for name in _VIDEO_COLUMNS)
     lasts_s, expected_s = to_s - from_s, row["length"] / info.fps
     is_long_enough = lasts_s >= expected_s - 0.5 / info.fps  # longer: includes frames from a discarded take
