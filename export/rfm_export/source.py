@@ -10,7 +10,6 @@ whole batch, and leaves nothing to the other GPUs.
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -25,9 +24,8 @@ from rfm import published
 from rfm.config import ExportConfig
 from rfm.engine.device import computation
 from rfm.engine.family import NETWORK, Checkpoint, Family, FrameEncoders, config_fields
-from rfm.files import read_run_config
-from rfm.published.hub import check_links, commit_of
-from rfm.published.provenance import Assumption, is_folder, license_of, source_name
+from rfm.published.hub import check_links
+from rfm.published.provenance import Assumption
 from rfm.published.run_config import find_run_config
 from rfm.weights import num_values
 from rfm_client.contract import ProgressSample
@@ -42,8 +40,6 @@ MOST_SAMPLES = 64  # small networks hardly gain from more
 TYPICAL_FRAMES, TYPICAL_PX = 8, 224
 TYPICAL_TASK = "put the red block in the bowl"
 _TERA = 1e12
-
-_SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # for example hub_token, wandb_api_key
 
 
 @dataclass(frozen=True)
@@ -95,7 +91,7 @@ def read_for_export(
     for note in published.notes(folder, loaded):
         say(note)
     gpus = num_gpus(settings)
-    origin = origin_of(source, folder, computation(checkpoint, settings.torch_dtype, on_gpu=gpus > 0))
+    origin = published.origin_of(source, folder, computation(checkpoint, settings.torch_dtype, on_gpu=gpus > 0))
     _check_graphs(settings, checkpoint.description)
     return Source(
         kind,
@@ -184,25 +180,6 @@ def typical_sample(checkpoint: Checkpoint) -> ProgressSample:
     return ProgressSample(random_trajectory(random, num_frames, description.widths, task=TYPICAL_TASK, size_px=size_px))
 
 
-def origin_of(source: str | Path, folder: Path, computation: str) -> Origin:
-    """Return the checkpoint's origin: source, commit, training run's config.yaml, licence.
-
-    For a folder, the source is the end of its path. config.yaml becomes JSON without secrets.
-
-    source: as the user named it
-    folder: the checkpoint's files; from the Hub, a snapshot named by its commit
-    computation: as in ``Origin``
-    """
-    file = find_run_config(folder)
-    return Origin(
-        source=source_name(source),
-        revision=None if is_folder(source) else commit_of(folder),
-        license=license_of(folder),
-        run_config={} if file is None else _public(read_run_config(file)),
-        computation=computation,
-    )
-
-
 def origin_in(description: Description) -> Origin:
     """Return the origin in an exported description."""
     return Origin(**{each.name: getattr(description, each.name) for each in fields(Origin)})
@@ -216,21 +193,6 @@ def described(checkpoint: Checkpoint, origin: Origin) -> Description:
 def described_encoders(encoders: Description, origin: Origin) -> Description:
     """Return the description for encoders that are exported with a scorer from this origin."""
     return replace(encoders, source=origin.source, revision=origin.revision)
-
-
-def _public(value: Any) -> Any:
-    """Return a YAML value in JSON types, without texts whose keys name a secret."""
-    if isinstance(value, dict):
-        kept = {str(key): inner for key, inner in value.items() if not _is_secret(str(key), inner)}
-        return {key: _public(inner) for key, inner in kept.items()}
-    if isinstance(value, (list, tuple, set)):
-        return [_public(inner) for inner in value]
-    is_plain = value is None or isinstance(value, (str, int)) or (isinstance(value, float) and math.isfinite(value))
-    return value if is_plain else str(value)
-
-
-def _is_secret(key: str, value: Any) -> bool:
-    return isinstance(value, (str, bytes)) and _SECRET.search(key) is not None
 
 
 def _network(checkpoint: Checkpoint) -> dict[str, Any]:

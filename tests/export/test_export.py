@@ -25,7 +25,7 @@ from rfm.families.rewind.checkpoint import RewindCheckpoint
 from rfm.files import CheckpointError
 from rfm_client.contract.description import Origin
 from rfm_export import ExportDiffersError, ExportError
-from rfm_export.source import origin_of, read_for_export
+from rfm_export.source import read_for_export
 from spoilt import WEIGHTS
 
 EMBEDDINGS = goldens.config("c1_t1_disc10")
@@ -263,11 +263,11 @@ def test_a_set_size_of_batches_wins_also_in_the_check(tmp_path: Path) -> None:
 
 def test_the_origin_of_a_checkpoint_of_the_hub_has_its_commit(tmp_path: Path) -> None:
     snapshot = tmp_path / "models--org--name" / "snapshots" / "0123abcd"
-    assert origin_of("org/name@best", snapshot, "") == Origin(
+    assert published.origin_of("org/name@best", snapshot, "") == Origin(
         source="org/name@best", revision="0123abcd", computation=""
     )
     snapshot.mkdir(parents=True)
-    assert origin_of(snapshot, snapshot, "") == Origin(source="org/name@0123abcd", computation="")
+    assert published.origin_of(snapshot, snapshot, "") == Origin(source="org/name@0123abcd", computation="")
 
 
 def test_the_configuration_of_the_training_run_is_kept_without_its_secrets(tmp_path: Path) -> None:
