@@ -59,6 +59,12 @@ _FIRST_FIELDS = ("video_feature_dim", "text_feature_dim", "hidden_dim", "num_lay
 _LIMITS = dict.fromkeys((*_FIRST_FIELDS, "progress_bins"), MAX_COUNT) | {"num_layers": 1024}
 _LAYERS = "transformer.layers."
 _STATED_TYPES: dict[str, type] = {"num_attention_heads": int, "max_len": int, "causal_mask": bool}
+# The paper's first code (https://github.com/Jiahui-3205/ReWiND_Release) predicts only progress, uses other names and
+# has no configuration. Its networks all have 8 attention heads and a causal mask. Its training script shows 16 frames
+# by default.
+_FIRST_CODES_FRAME = "first_pos_embed"  # [1, D]; added to the first frame
+_FIRST_CODES_UNREAD = "class_token"  # a parameter that the network never reads
+_FIRST_CODES_SETTINGS = {"num_attention_heads": 8, "causal_mask": True, "max_len": 16}
 
 
 def _loaded(
@@ -141,6 +147,8 @@ def reads(folder: Path) -> bool:
 def load(folder: Path, options: CheckpointConfig) -> Loaded:
     """Load a checkpoint from a local folder. Raises CheckpointError."""
     network = read_weights(folder)
+    if _FIRST_CODES_FRAME in network:
+        return _of_first_code(folder, network, options)
     image_encoder = take_prefix(network, IMAGE_ENCODER_PREFIX)
     text_encoder = take_prefix(network, TEXT_ENCODER_PREFIX)
     stated, assumed = _stated(folder)
@@ -151,6 +159,26 @@ def load(folder: Path, options: CheckpointConfig) -> Loaded:
         network.pop("first_embedding_B", None)
     checkpoint = RewindCheckpoint(config, network, image_encoder, text_encoder)
     return _loaded(checkpoint, assumed, (options.image_encoder, options.text_encoder))
+
+
+def _of_first_code(folder: Path, weights: dict[str, Tensor], options: CheckpointConfig) -> Loaded:
+    """Return the checkpoint, with its weights renamed to upstream's names."""
+    first = weights.pop(_FIRST_CODES_FRAME)
+    require(_FIRST_CODES_FRAME, first.dim() == 2, "2 axes", list(first.shape), CheckpointError)
+    weights.pop(_FIRST_CODES_UNREAD, None)
+    weights["first_embedding_A"] = first[None]
+    if options.image_encoder or options.text_encoder:
+        raise CheckpointError(
+            f"{folder}: encoders: expected none for a checkpoint of the first ReWiND code, which crops frames and does "
+            "not resize them; encode frames as it does, and send video_embeddings and text_embedding"
+        )
+    read, unproven = _stated(folder)
+    read = {name: value for name, value in read.items() if name not in {each.name for each in unproven}}
+    stated = {**_FIRST_CODES_SETTINGS, **read}
+    config = _config(folder, weights, {**stated, "trained_frames": stated["max_len"]})
+    defaults = {name: value for name, value in _FIRST_CODES_SETTINGS.items() if name not in read}
+    assumed = (Assumption(name, value, "default of the first ReWiND code") for name, value in defaults.items())
+    return _loaded(RewindCheckpoint(config, weights), tuple(assumed))
 
 
 def _config(folder: Path, weights: Mapping[str, Tensor], stated: Mapping[str, Any]) -> RewindConfig:
