@@ -97,8 +97,7 @@ EXCEPTIONS = {
     "benchmarks/random_checkpoints.py": {"rfm"},
     "benchmarks/real_size.py": {"rfm"},
     "benchmarks/serving.py": {"rfm", "rfm_export"},
-    "benchmarks/peers/fastapi_server.py": {"rfm"},  # the peers score with our engine, or weights
-    "benchmarks/peers/mosec_server.py": {"rfm"},
+    "benchmarks/peers/engines.py": {"rfm"},  # the peers score with our engine, or weights
     "benchmarks/peers/upstream_forward.py": {"rfm"},
 }
 FEWEST_WORDS = 4  # of a docstring
