@@ -127,7 +127,7 @@ FAILURES = {
         "(expected the node content, but found '<stream end>')",
     ),
     "rfm export nope --repository out": (1, f"{SOURCE} 'nope'"),
-    "rfm export file.txt --repository out": (1, f"{SOURCE} the file file.txt"),
+    "rfm export file.txt --repository out": (1, f"{SOURCE} the file file.txt; name its folder, ."),
     "rfm export empty --repository out --name 'a b'": (1, "--name: expected letters, digits, _ and -, got 'a b'"),
     f"rfm models list --url {NOBODY}": (1, f"{NOBODY}: no connection: Connection refused: {STARTED}"),
     "rfm try nope.mp4 --task x": (1, "video: expected a video file, got none (nope.mp4)"),

@@ -86,9 +86,9 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path, text: str) -> None:
 
 
 BAD = {  # text, and the message after the file name
-    "unknown key": ("num_gpu: 1", r"num_gpu: expected one of export, .* unknown key$"),
+    "unknown key": ("num_gpu: 1", r"num_gpu: expected one of export, .* unknown key; perhaps num_gpus or export\.num_gpus$"),
     "unknown key of a section": ("gateway: {foo: 1}", r"gateway\.foo: expected one of gateway\.port, .*, got an unknown key$"),
-    "a key of another section": ("serve: {num_gpus: 1}", r"serve\.num_gpus: expected one of .*, got an unknown key$"),
+    "a key of another section": ("serve: {num_gpus: 1}", r"serve\.num_gpus: .*; perhaps num_gpus or export\.num_gpus$"),
     "a key in and outside its section": (
         "model_path: a\nexport: {checkpoint: b}",
         r"export\.checkpoint: expected once, got export\.checkpoint twice",
