@@ -295,9 +295,9 @@ REFUSED: dict[str, tuple[Callable[[Any], object], str]] = {
     ),
     "an attribute that is no JSON": (
         told("data", "env_args", "{'env_name': 'Lift'}"),
-        f"{NO_TASK}problem_info or env_args: expected a task as a sentence, got none",
+        f"{NO_TASK}problem_info or env_args (no JSON object): expected a task as a sentence, got none",
     ),
-    "an attribute of numbers": (told("data", "env_args", [1, 2]), "env_args: expected a task as a sentence, got none"),
+    "an attribute of numbers": (told("data", "env_args", [1, 2]), "env_args (no JSON object): expected a task as a se"),
     "fewer actions than frames": (put("data/demo_1/actions", np.zeros((3, 7))), "got obs/front 5, actions 3"),
 }
 
@@ -358,7 +358,10 @@ NOTES: dict[str, tuple[Callable[[Any], object], list[str]]] = {
         put("data/demo_0/obs/all", h5py.SoftLink("/data/demo_0/obs")),
         ["left out: all: a group: expected its pictures one level up"],
     ),
-    "an attribute that is no JSON": (told("data", "problem_info", b"libero"), []),
+    "an attribute that is no JSON": (
+        told("data", "problem_info", b"libero"),
+        ["data: problem_info is not a JSON object, so it states neither a task nor LIBERO"],
+    ),
     "one sentence in an array": (told("data/demo_0", "language", np.array(["close it"], object)), []),
     "no text": (told("data/demo_0", "language", h5py.Empty("S4")), []),
     "numbers of another form": (put("data/demo_0/obs/point", np.zeros(NUM_FRAMES, [("x", "f4"), ("y", "f4")])), []),
