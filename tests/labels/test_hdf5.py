@@ -438,6 +438,16 @@ def test_broken_files_of_frames_are_an_error_with_file_camera_and_frame(
     assert all(fault.startswith(f"{file}: observations/images/left: {message}") for fault in faults)
 
 
+def test_an_episode_of_pixels_alone_has_a_size_of_robomind_s_and_blue_first(tmp_path: Path) -> None:
+    frames = np.random.default_rng(5).integers(0, 256, (2, 480, 640, 3), np.uint8)
+    cameras = {"top": [frame.tobytes() for frame in frames], "left": [b"x"] * 2}
+    dataset = open_dataset(writers.write_robomind(tmp_path / "trajectory.hdf5", cameras))
+    dataset.check(dataset.episodes[0], "top")
+    np.testing.assert_array_equal(list(dataset.frames(dataset.episodes[0], "top")), frames[..., ::-1])
+    with pytest.raises(DatasetError, match="left: frame 0: expected an image, got "):
+        list(dataset.frames(dataset.episodes[0], "left"))
+
+
 PLACES: dict[str, tuple[Callable[[Any], object], str | None]] = {
     "an attribute": (told("/", "instruction", np.bytes_(TASK)), None),
     "a dataset": (put("language_raw", np.array([TASK], h5py.string_dtype())), None),
