@@ -236,8 +236,8 @@ BAD_SAMPLES: dict[str, tuple[Any, str, str]] = {
     "names of images": (of_frames(["0.png", "1.png"]), "trajectory frames", NO_FILES),
     "the name of a file": (
         progress({"embeddings_path": "a.npz"}),
-        "trajectory frames",
-        "expected frames, got neither.*",
+        "trajectory embeddings_path",
+        "expected video_embeddings as an array, since the gateway reads no files, got the name of a file",
     ),
     "no trajectory": ({"sample_type": "progress"}, "trajectory", "expected a value, got none"),
     "no second": ({**preference(FIRST, SECOND), "rejected_trajectory": 5}, "rejected_trajectory", ".*object, got 5"),

@@ -124,6 +124,22 @@ def test_a_table_lists_episodes_of_one_kind(folders: Path) -> None:
         open_dataset(folders)
 
 
+def test_a_file_whose_name_looks_like_a_pattern_is_a_file(tmp_path: Path) -> None:
+    np.save(tmp_path / "a*b.npy", numbered(2))
+    (tmp_path / "a*b.txt").touch()
+    for task in (TASK, None):
+        dataset = open_dataset(tmp_path, task=task)
+        assert ([episode.name for episode in dataset.episodes], *dataset.notes) == (["a*b.npy"],)
+        (tmp_path / "tasks.csv").write_text(f"video,task\na*b.npy,{TASK}\n")
+
+
+def test_a_table_of_before_is_refused_also_with_a_task_for_all(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", numbered(2))
+    (tmp_path / "tasks.json").touch()
+    with pytest.raises(DatasetError, match=r"expected tasks\.csv .*, got tasks\.json: write it as tasks\.csv"):
+        open_dataset(tmp_path, task=TASK)
+
+
 def write_demos(file: Path, task: str) -> None:
     write_robomimic(file, [{"front": numbered(5)}], task)
 
@@ -146,6 +162,8 @@ def test_a_folder_of_hdf5_files_is_labelled_file_by_file(tmp_path: Path, capsys:
         labels = read_episode_labels(root / folder / f"{stem}.rfm_progress.parquet", 0)
         assert labels is not None
         np.testing.assert_allclose(labels.fused.progress, brightness(numbered(5)), atol=1e-6)
+    for folder in (root, root / "more"):
+        (folder / "task_2.rfm_rewards.hdf5").write_bytes(b"labels of 0.4")
     assert asked(root, LabelOptions())[::2] == (ExitCode.OK, set())  # files of labels are no datasets
     capsys.readouterr()
 
@@ -207,6 +225,11 @@ UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, the opened path, the
         ["a.mp4"],
         "",
         'got none: write it, or, if all of them have one task, give it: --task "SE',
+    ),
+    "a table of before": (
+        ["a.mp4", "tasks.json"],
+        "",
+        "got tasks.json: write it as tasks.csv, with the columns video and",
     ),
     "an empty folder": ([".hidden"], "", "got an empty folder: put a video, an array or a folder of pictures for each"),
     "other files": (["a.txt"], "", "got other files: put a video, an array or a folder of pictures for each episode"),

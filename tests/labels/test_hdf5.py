@@ -295,9 +295,9 @@ REFUSED: dict[str, tuple[Callable[[Any], object], str]] = {
     ),
     "an attribute that is no JSON": (
         told("data", "env_args", "{'env_name': 'Lift'}"),
-        f"{NO_TASK}problem_info or env_args: expected a task as a sentence, got none",
+        f"{NO_TASK}problem_info or env_args (no JSON object): expected a task as a sentence, got none",
     ),
-    "an attribute of numbers": (told("data", "env_args", [1, 2]), "env_args: expected a task as a sentence, got none"),
+    "an attribute of numbers": (told("data", "env_args", [1, 2]), "env_args (no JSON object): expected a task as a se"),
     "fewer actions than frames": (put("data/demo_1/actions", np.zeros((3, 7))), "got obs/front 5, actions 3"),
 }
 
@@ -358,7 +358,10 @@ NOTES: dict[str, tuple[Callable[[Any], object], list[str]]] = {
         put("data/demo_0/obs/all", h5py.SoftLink("/data/demo_0/obs")),
         ["left out: all: a group: expected its pictures one level up"],
     ),
-    "an attribute that is no JSON": (told("data", "problem_info", b"libero"), []),
+    "an attribute that is no JSON": (
+        told("data", "problem_info", b"libero"),
+        ["data: problem_info is not a JSON object, so it states neither a task nor LIBERO"],
+    ),
     "one sentence in an array": (told("data/demo_0", "language", np.array(["close it"], object)), []),
     "no text": (told("data/demo_0", "language", h5py.Empty("S4")), []),
     "numbers of another form": (put("data/demo_0/obs/point", np.zeros(NUM_FRAMES, [("x", "f4"), ("y", "f4")])), []),
@@ -433,6 +436,16 @@ def test_broken_files_of_frames_are_an_error_with_file_camera_and_frame(
         1 if "a frame of" in message or "mark" in message else 2
     )  # found by decoding alone, and by the check alone
     assert all(fault.startswith(f"{file}: observations/images/left: {message}") for fault in faults)
+
+
+def test_an_episode_of_pixels_alone_has_a_size_of_robomind_s_and_blue_first(tmp_path: Path) -> None:
+    frames = np.random.default_rng(5).integers(0, 256, (2, 480, 640, 3), np.uint8)
+    cameras = {"top": [frame.tobytes() for frame in frames], "left": [b"x"] * 2}
+    dataset = open_dataset(writers.write_robomind(tmp_path / "trajectory.hdf5", cameras))
+    dataset.check(dataset.episodes[0], "top")
+    np.testing.assert_array_equal(list(dataset.frames(dataset.episodes[0], "top")), frames[..., ::-1])
+    with pytest.raises(DatasetError, match="left: frame 0: expected an image, got "):
+        list(dataset.frames(dataset.episodes[0], "left"))
 
 
 PLACES: dict[str, tuple[Callable[[Any], object], str | None]] = {

@@ -412,6 +412,12 @@ def test_oddities_that_lerobot_reads_are_read_with_a_note(tmp_path: Path, change
     assert list(dataset.notes) == notes
 
 
+@pytest.mark.parametrize("tolerance_s", [0, -1, float("nan"), float("inf"), True, "a"])
+def test_a_tolerance_is_a_number_above_0(tolerance_s: Any) -> None:
+    with pytest.raises(DatasetError, match=f"tolerance_s: expected a number above 0, got '?{tolerance_s}"):
+        open_dataset(LEROBOT / "toy_v30_many", tolerance_s=tolerance_s)
+
+
 OPENED = f"""
 import sys
 from rfm_labels import DatasetError, open_dataset

@@ -114,6 +114,7 @@ class TrajectoryInput(BaseModel):
         BeforeValidator(_array),
         _array_schema("[Dt], the embedding of the task; if it is missing, a served encoder encodes the task", 1),
     ] = None
+    embeddings_path: Any = None  # alone it is refused, since the gateway reads no files
     data_source: Any = None
     metadata: Any = None
 

@@ -214,6 +214,9 @@ class _Conversion:
 
     def _of_frames(self, given: schema.TrajectoryInput) -> Trajectory:
         if given.frames is None and given.video_embeddings is None:
+            if given.embeddings_path is not None:
+                expected = "video_embeddings as an array, since the gateway reads no files"
+                raise InvalidSampleError.at("embeddings_path", expected, "the name of a file")
             raise InvalidSampleError.at("frames", "frames", "neither frames nor video_embeddings")
         if given.frames is None and self.embedding_model is not None:
             raise InvalidSampleError.at("video_embeddings", "them in both trajectories or neither", "one of two")

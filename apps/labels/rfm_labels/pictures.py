@@ -5,14 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rfm_client.plot import save
 from rfm_labels.evaluation import LabelComparison
 from rfm_labels.label_files import read_provenance
-
-if TYPE_CHECKING:
-    pass
 
 WIDTH_IN = 7.0  # page width
 AXES_IN = 1.3  # height

@@ -308,19 +308,23 @@ class Dataset(ABC):
         return f"{episode.name}: {camera}"
 
     def frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        """Yield the T frames in order, uint8 [H, W, 3], corrected to upright RGB.
+        """Yield the T ``whole_frames``, corrected to upright RGB."""
+        correction = self.corrections.get(camera, Correction())
+        return map(correction.applied, self.whole_frames(episode, camera))
+
+    def whole_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
+        """Yield the T ``stored_frames``.
 
         Raises DatasetError, also for frames of different sizes, and in the end for a wrong count.
         """
-        correction, where = self.corrections.get(camera, Correction()), self.place(episode, camera)
-        count, size = 0, ""
+        where, count, size = self.place(episode, camera), 0, ""
         for frame in self.stored_frames(episode, camera):
             own = f"{frame.shape[0]} x {frame.shape[1]} pixels"
             size = size or own
             require(f"{where}: frame {count}", own == size, f"a frame of {size}, as the first", own)
             count += 1
             if count <= episode.num_frames:
-                yield correction.applied(frame)
+                yield frame
         require(where, count == episode.num_frames, f"{episode.num_frames} frames", count)
 
 

@@ -52,8 +52,8 @@ _UNITREE_FILE, _UNITREE_FOLDER = "data.json", "colors"
 
 
 def is_pattern(path: Path) -> bool:
-    """True if the last path component is a file name pattern."""
-    return "*" in path.name
+    """True if the last path component is a file name pattern, and no name of a file or folder that is there."""
+    return "*" in path.name and not path.exists()
 
 
 def matching(pattern: str, files: Sequence[str]) -> list[str]:

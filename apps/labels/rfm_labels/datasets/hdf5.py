@@ -32,6 +32,7 @@ from rfm_labels.datasets.hdf5_layouts import (
     opened_hdf5,
     task_of,
     task_places,
+    unread_documents,
 )
 from rfm_labels.datasets.hdf5_pictures import (
     EncodedFrames,
@@ -60,7 +61,7 @@ class _Demo:
     faults: by observation, why it is no camera's frames; empty: it is
     pictures: observations that may be pictures
     lengths: frame count by camera
-    files: first file by camera whose frames are files
+    marks: by camera whose frames are files, whether the first has RoboTwin's mark of RGB
     num_actions: None: not in the file
     """
 
@@ -71,7 +72,7 @@ class _Demo:
     faults: Mapping[str, str]
     pictures: Sequence[str]
     lengths: Mapping[str, int]
-    files: Mapping[str, bytes]
+    marks: Mapping[str, bool]
     num_actions: int | None
 
     @classmethod
@@ -92,7 +93,11 @@ class _Demo:
             faults,
             [each for each, value in observations.items() if is_picture(value, are_pictures)],
             {each: len(value) - skipped for each, value in cameras.items()},
-            {each: first_file(value) for each, value in cameras.items() if is_encoded(value, are_pictures)},
+            {
+                each: has_rgb_mark(first_file(value))
+                for each, value in cameras.items()
+                if is_encoded(value, are_pictures)
+            },
             actions[0] - skipped if actions else None,
         )
 
@@ -145,6 +150,7 @@ class Hdf5Dataset(CountedDataset):
                 for number, (name, group) in groups.items()
             }
             self.filter_keys = filter_keys(opened)
+            self._broken = unread_documents(attributes)
             is_libero = layout is ROBOMIMIC and is_of_libero(attributes)
             self.fps = layout.fps or fps_of(attributes)
             is_upright = "opencv" in str(attribute(attributes, "macros_image_convention"))  # robosuite turned frames
@@ -155,18 +161,20 @@ class Hdf5Dataset(CountedDataset):
         known = [each for each in self._pictures if any(each in demo.lengths for demo in self._demos.values())]
         if not known:
             self.cameras_in(self.numbers)  # raises the reason
-        self._files = {camera: each for demo in self._demos.values() for camera, each in demo.files.items()}
-        unmarked = [camera for camera, each in self._files.items() if layout is ROBOTWIN and not has_rgb_mark(each)]
+        self._marks = {camera: mark for demo in self._demos.values() for camera, mark in demo.marks.items()}
+        unmarked = [camera for camera, mark in self._marks.items() if layout is ROBOTWIN and not mark]
         defaults: dict[str, Orientation] = dict.fromkeys(known, _LIBERO) if is_libero and not is_upright else {}
         self.corrections = corrections.of_cameras(known, defaults, dict.fromkeys(unmarked, "bgr"))
         uncorrected = [camera for camera in known if {"", camera}.isdisjoint(corrections.orient)]
-        self.notes = [] if is_upright else _notes(uncorrected, is_libero)
+        why = "is not a JSON object, so it states neither a task nor LIBERO"
+        self.notes = [f"data: {name} {why}" for name in self._broken]
+        self.notes += [] if is_upright else _notes(uncorrected, is_libero)
         self.notes += self._notes_on_colours(corrections, unmarked) + self._notes_on_layout()
 
     def _notes_on_layout(self) -> list[str]:
         if self._layout is ROBOMIMIC:
             return []
-        forms = [f"{camera}{' (JPEG or PNG)' * (camera in self._files)}" for camera in self.cameras]
+        forms = [f"{camera}{' (JPEG or PNG)' * (camera in self._marks)}" for camera in self.cameras]
         notes = [f"layout: {self._layout.name}, cameras {', '.join(forms)}"]
         if self._layout.skipped:
             notes.append(
@@ -179,7 +187,7 @@ class Hdf5Dataset(CountedDataset):
 
     def _notes_on_colours(self, asked: AskedCorrections, unmarked: Sequence[str]) -> list[str]:
         """A note on red and blue, for cameras without a channel order from the caller."""
-        uncorrected = [camera for camera in self._files if {"", camera}.isdisjoint(asked.channels)]
+        uncorrected = [camera for camera in self._marks if {"", camera}.isdisjoint(asked.channels)]
         swapped = [camera for camera in uncorrected if camera in unmarked]
         if swapped:
             why = "RoboTwin's JPEG files without its mark of RGB, from before September 2026, store red as blue"
@@ -193,7 +201,7 @@ class Hdf5Dataset(CountedDataset):
     def read_episode(self, number: int) -> DatasetEpisode:
         demo = self._demos[number]
         where = f"{self.file}: {self._layout.group_of(demo.name)}".removesuffix(": ")
-        task = self.given_task.of(f"{where}: {task_places(self.file, self._layout)}", demo.task)
+        task = self.given_task.of(f"{where}: {task_places(self.file, self._layout, self._broken)}", demo.task)
         counts = ", ".join(f"{key} {count}" for key, count in demo.counts(self.cameras).items())
         require(where, self.length(number) > 0, "one length, above 0", counts or _described(demo.forms))
         return DatasetEpisode(number, demo.name, task, self.length(number), self.frames_before(number))
@@ -227,7 +235,7 @@ class Hdf5Dataset(CountedDataset):
         return cameras, {name: fault for name, fault in faults.items() if fault}
 
     def decoder(self, camera: str) -> str | None:
-        return Picture.decoder() if camera in self._files else None
+        return Picture.decoder() if camera in self._marks else None
 
     def identity(self, episode: DatasetEpisode, camera: str) -> str:
         with opened_hdf5(self.file) as opened:

@@ -102,6 +102,12 @@ def document(attributes: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
+def unread_documents(attributes: Mapping[str, Any]) -> list[str]:
+    """Name the attributes that should hold a JSON object but do not."""
+    broken = [name for name in DOCUMENTS if name in attributes and not document(attributes, name)]
+    return [name for name in broken if str(attribute(attributes, name)).strip() not in ("", "{}")]
+
+
 def attribute(attributes: Mapping[str, Any], name: str) -> Any:
     """Read an attribute: bytes become text, an array becomes a list, a single element stands alone.
 
@@ -269,10 +275,11 @@ def layout_of(opened: Any) -> Layout:
     return _MANISKILL if "data" not in opened and any(map(_TRAJECTORY.fullmatch, opened)) else ROBOMIMIC
 
 
-def task_places(file: Path, layout: Layout) -> str:
-    """Return where ``task_of`` looks, for messages."""
+def task_places(file: Path, layout: Layout, broken: Sequence[str]) -> str:
+    """Return where ``task_of`` looks, for messages. broken: as ``unread_documents`` names them"""
     if layout.is_in_data:
-        return f"ep_meta, or data: {' or '.join(DOCUMENTS)}"
+        documents = [name + " (no JSON object)" * (name in broken) for name in DOCUMENTS]
+        return f"ep_meta, or data: {' or '.join(documents)}"
     return f"attribute or dataset {', '.join(_TASK_NAMES)}, or RoboTwin's instructions/{file.stem}.json"
 
 

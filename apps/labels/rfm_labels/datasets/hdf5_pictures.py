@@ -6,7 +6,7 @@ A frame's file is a zero-padded byte row, a fixed-length text, or an array with 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -19,11 +19,12 @@ from rfm_labels.datasets.faults import require
 from rfm_labels.datasets.stored_files import faults_at
 
 _STARTS = (b"\xff\xd8\xff", b"\x89PNG")  # first bytes in JPEG and PNG files
+_RAW_SHAPES = ((480, 640, 3), (720, 1280, 3))  # of RoboMIND's cameras, which store some frames as pixels
 _RGB_MARK = b"\xff\xfe\x00\x0aXPL-RGB1"  # comment in RoboTwin's JPEG files whose red is red
 
 
 class EncodedFrames:
-    """One camera's frames as T files. Pixels between the files, as in RoboMIND, are as OpenCV has them: blue first.
+    """One camera's frames as T files. Pixels, as some of RoboMIND, are as OpenCV has them: blue first.
 
     stored: HDF5 dataset with T files
     where: file and path, for messages
@@ -42,7 +43,7 @@ class EncodedFrames:
         """Raise DatasetError if a frame's header is not a picture's."""
         marked = set()
         for where, file in self._whole_files():
-            if not self._are_pixels(file):
+            if self._raw_shape(file) is None:
                 with faults_at(where):
                     Picture(file).check()
                 marked.add(has_rgb_mark(file))
@@ -52,8 +53,8 @@ class EncodedFrames:
     def pixels(self) -> Iterator[UInt8Array]:
         """Yield the T frames, uint8 [H, W, 3]. Raises DatasetError with the frame number."""
         for where, file in self._whole_files():
-            if self._are_pixels(file):
-                yield np.frombuffer(file, np.uint8).reshape(self._shape)[..., ::-1]
+            if shape := self._raw_shape(file):
+                yield np.frombuffer(file, np.uint8).reshape(shape)[..., ::-1]
                 continue
             with faults_at(where):
                 yield Picture(file).pixels()
@@ -67,17 +68,19 @@ class EncodedFrames:
             require(where, is_whole, "a whole JPEG file", got)
             yield where, file
 
-    def _are_pixels(self, file: bytes) -> bool:
-        return bool(file) and not file.startswith(_STARTS) and len(file) == np.prod(self._shape)
+    def _raw_shape(self, file: bytes) -> tuple[int, ...] | None:
+        """[H, W, 3] if a frame is stored as pixels; None: it is a file."""
+        shapes = () if file.startswith(_STARTS) else self._raw_shapes
+        return next((shape for shape in shapes if len(file) == np.prod(shape)), None)
 
     @cached_property
-    def _shape(self) -> tuple[int, ...]:
-        """The first picture's [H, W, 3]; empty without one."""
+    def _raw_shapes(self) -> Sequence[tuple[int, ...]]:
+        """The first picture's [H, W, 3]; RoboMIND's if all frames are pixels."""
         for where, file in self._whole_files():
             if file.startswith(_STARTS):
                 with faults_at(where):
-                    return Picture(file).pixels().shape
-        return ()
+                    return [Picture(file).pixels().shape]
+        return _RAW_SHAPES
 
 
 def has_rgb_mark(file: bytes) -> bool:

@@ -6,7 +6,6 @@ Frame t belongs to row t; in a video, it is the frame at the row's time.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -16,6 +15,7 @@ from typing import Any
 
 from rfm_client import UInt8Array
 from rfm_client.frames import Picture, Video
+from rfm_client.options import InvalidValueError, checked_finite
 from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, listed, require
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S, Frames, Part, VideoRows
@@ -63,8 +63,11 @@ class LeRobotDataset(Dataset):
         corrections: AskedCorrections = AskedCorrections(),
         tolerance_s: float = TOLERANCE_S,
     ) -> None:
-        require("tolerance_s", 0 < tolerance_s < math.inf, "a number above 0", tolerance_s)
-        self._tolerance_s = tolerance_s
+        try:
+            self._tolerance_s = checked_finite("tolerance_s", tolerance_s, "a number above 0")
+        except InvalidValueError as error:
+            raise DatasetError.like(error) from None
+        require("tolerance_s", tolerance_s > 0, "a number above 0", tolerance_s)
         self.root = root
         self.source = source or root.resolve().name
         self.revision = revision

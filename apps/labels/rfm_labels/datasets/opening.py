@@ -68,7 +68,7 @@ _KINDS: dict[str, tuple[type[EpisodeFiles], str]] = {  # reader, and what an epi
 }
 _ORDER = ("videos", "arrays", "HDF5 files", "recordings of Unitree", "folders of pictures", "pictures")
 _OWN_TASKS = ("arrays", "recordings of Unitree")
-_OUR_FILES = re.compile(r".*_summary\.png")  # beside labelled episodes
+_OUR_FILES = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside labelled episodes; HDF5: from 0.4
 
 
 def read_table_of_tasks(table: Path, *, has_tasks: bool) -> Mapping[str, str | None]:
@@ -197,14 +197,15 @@ def open_to_show(source: str) -> LeRobotDataset | Hdf5Dataset | RldsDataset:
 def hdf5_files(folder: str | Path) -> list[Path]:
     """List the HDF5 datasets in a folder and its subfolders; empty if it is no folder, or holds other data.
 
-    Hidden files are left out. Paths sort with 2 before 10.
+    Label files and hidden files are left out. Paths sort with 2 before 10.
     """
     root = Path(folder)
     is_other = any((root / name).is_file() for name in (INFO_FILE, TABLE))
     if not root.is_dir() or is_other or set(_found(root)) - {"HDF5 files"}:
         return []
     names = (str(file.relative_to(root)) for file in root.rglob("*") if file.suffix.lower() in SUFFIXES)
-    return [root / name for name in in_natural_order(name for name in names if "/." not in f"/{name}")]
+    shown = [name for name in names if "/." not in f"/{name}" and not _OUR_FILES.fullmatch(name)]
+    return [root / name for name in in_natural_order(shown)]
 
 
 def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -> Dataset:
@@ -226,7 +227,9 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
     require(path, path.is_dir(), _LAYOUTS, "neither")
     kind, names = _listed(path)
     reader, episode = _KINDS[kind]
-    expected = f"{TABLE} with the task of each {episode}"
+    expected, old_table = f"{TABLE} with the task of each {episode}", path / "tasks.json"  # as 0.4 read it
+    got = f"{old_table.name}: write it as {TABLE}, with the columns video and task"
+    require(path, not old_table.is_file(), expected, got)
     got = f"none: write it, or, if all of them have one task, give it: {_GIVE_TASK}"
     require(path, task.text is not None or kind in _OWN_TASKS, expected, got)
     return reader(path, dict.fromkeys(names), path, task, corrections)
@@ -234,7 +237,7 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
 
 def _unlisted(table: Path, kind: str, names: Collection[str]) -> list[str]:
     """A note on episodes that lie beside the table's but are not listed; empty if there are none."""
-    names = {str(Path(name).parent) if is_pattern(Path(name)) else name for name in names}
+    names = {str(Path(name).parent) if is_pattern(table.parent / name) else name for name in names}
     beside = {table.parent, *((table.parent / name).parent for name in names)} if kind in _SUFFIXES else {table.parent}
     found = [folder / name for folder in sorted(beside) if folder.is_dir() for name in _found(folder).get(kind, ())]
     if kind == "folders of pictures":  # ``_found`` also has folders without pictures
