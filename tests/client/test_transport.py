@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import grpc
 import numpy as np
@@ -62,16 +62,19 @@ def listening(answer: Callable[[socket.socket], None]) -> Iterator[int]:
 
 
 def silent(connection: socket.socket) -> None:
-    while connection.recv(65536):
-        continue
-    connection.close()
+    with connection, suppress(ConnectionResetError):
+        while connection.recv(65536):
+            continue
 
 
 def saying(content: bytes) -> Callable[[socket.socket], None]:
     def answer(connection: socket.socket) -> None:
-        connection.recv(65536)
-        connection.sendall(content)
-        connection.close()
+        # All of the request: otherwise a caller that still writes would get another error.
+        with connection, connection.makefile("rb") as request:
+            head = b"".join(iter(request.readline, b"\r\n")).lower()
+            _, _, length = head.partition(b"content-length:")
+            request.read(int(length.split()[0]) if length else 0)
+            connection.sendall(content)
 
     return answer
 
@@ -108,6 +111,24 @@ def test_whatever_answers_the_error_is_ours(
     assert caught.value.may_have_ended_server is may_have_ended
 
 
+@pytest.mark.parametrize("refusal", ["403 Forbidden", "404 Not Found"])
+def test_over_http_a_server_that_refuses_its_metadata_is_ready(refusal: str) -> None:
+    """As ``--http-restricted-api`` of Triton does, and proxies that let only some paths through."""
+    asked: list[bytes] = []
+
+    def answer(connection: socket.socket) -> None:
+        with connection, suppress(ConnectionResetError):
+            while head := connection.recv(65536):
+                asked.append(head.split()[1])
+                status = "200 OK" if asked[-1].endswith(b"/ready") else refusal
+                connection.sendall(f"HTTP/1.1 {status}\r\nContent-Length: 0\r\n\r\n".encode())
+
+    with listening(answer) as port, RewardClient(f"http://127.0.0.1:{port}", model="rfm") as client:
+        assert client.is_ready()
+        assert client.is_ready()
+    assert asked.count(b"/v2") <= 2  # one for each of the model's two names
+
+
 def test_a_redirect_is_an_error_and_never_followed() -> None:
     """It would carry frames and headers to an unknown server."""
     arrived: list[socket.socket] = []
@@ -142,6 +163,9 @@ def test_a_request_over_two_gib_is_refused_before_it_is_copied() -> None:
         "(subsample, or --fps for videos), or share memory with a server on this host (shared_memory)"
     )
     check_size({"frames": frames}, {"frames"})  # which go through shared memory
+    texts = np.full(2**15, b"x" * 2**16, object)  # 2 GiB, all the same text
+    with pytest.raises(InvalidSampleError, match=r"^task: expected at most 2\.15 GB in a request, got 2\.15 GB"):
+        check_size({"task": texts}, ())
 
 
 @contextmanager
