@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Iterator
 
 import pytest
@@ -10,13 +11,15 @@ import pytest
 from client_commands import invoke
 from engine_server import EngineServer
 from proxies import HttpProxy, Proxy
-from rfm_client import RewardClient
+from rfm_client import DeadlineExceededError, RewardClient
 from rfm_client.contract.addresses import grpc_proxy
+from rfm_client.contract.triton import unreachable
 from rfm_client.serving import ServerStatus
 from servers import Endpoints
 
 VARIABLES = ("http_proxy", "https_proxy", "grpc_proxy", "HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY")
 DEAD = "http://user:secret@127.0.0.1:9"
+SHOWN = "http://***@127.0.0.1:9"
 ELSEWHERE = "elsewhere.invalid"  # which only a proxy can find
 
 
@@ -57,31 +60,56 @@ def test_other_hosts_are_reached_through_it(proxy: HttpProxy, monkeypatch: pytes
     assert ServerStatus.read(f"grpc://{ELSEWHERE}:8001", metrics_url="http://127.0.0.1:1").ready
 
 
-def test_an_error_names_the_variable_but_not_its_value(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_names_the_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("grpc_proxy", DEAD)
     for command in ("sample", "status"):
         message = invoke(command, "--url", "grpc://192.0.2.1:8001").stderr
-        assert "add the host to no_proxy, unless grpc_proxy names the proxy that leads to it" in message
+        assert f"192.0.2.1:8001 through grpc_proxy={SHOWN}: no connection: " in message
+        assert "add the host to no_proxy, unless this proxy leads to it" in message
         assert "secret" not in message
+    monkeypatch.setenv("no_proxy", "192.0.2.0/24")
+    assert "proxy" not in str(unreachable("grpc://192.0.2.1:8001", "Connection refused"))
 
 
-VARIABLE = {
+def test_an_error_names_a_proxy_that_does_not_answer(engines: EngineServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        value = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        monkeypatch.setenv("http_proxy", value)
+        url = "grpc://192.0.2.1:8001"
+        late = f"^{url} through http_proxy={value}: no answer within 0.5 s$"
+        with RewardClient(url, timeout_s=0.5) as client, pytest.raises(DeadlineExceededError, match=late):
+            client.model_info()
+        with pytest.raises(DeadlineExceededError, match=late):
+            ServerStatus.read(url, timeout_s=0.5)
+        monkeypatch.setenv("http_proxy", DEAD)
+        error = ServerStatus.read(engines.url, metrics_url="http://192.0.2.1:8002/metrics").metrics_error
+        assert f"(through http_proxy={SHOWN})" in str(error)
+
+
+EXCEPTED = {
     "no variable": ({}, None),
     "empty": ({"grpc_proxy": "", "http_proxy": DEAD}, None),
-    "the first that is set": ({"http_proxy": DEAD, "grpc_proxy": DEAD}, "grpc_proxy"),
+    "the first that is set": ({"http_proxy": "http://b:1", "grpc_proxy": "http://a:1"}, "grpc_proxy=http://a:1"),
+    "the end of its name": ({"http_proxy": DEAD, "no_proxy": ".LAB"}, None),
+    "others": ({"http_proxy": DEAD, "no_proxy": "other.lab,localhost"}, f"http_proxy={SHOWN}"),
+    "gRPC's own": ({"http_proxy": DEAD, "no_proxy": ".lab", "no_grpc_proxy": "other"}, f"http_proxy={SHOWN}"),
     "upper case": ({"HTTP_PROXY": DEAD}, None),
+    "the host beside a network": ({"http_proxy": DEAD, "no_proxy": "10.0.0.0/8, server.lab"}, None),
 }
 
 
-@pytest.mark.parametrize(("environment", "expected"), VARIABLE.values(), ids=VARIABLE)
-def test_which_variable_grpc_reads(
+@pytest.mark.parametrize(("environment", "expected"), EXCEPTED.values(), ids=EXCEPTED)
+def test_which_proxy_grpc_takes(
     proxy: HttpProxy, monkeypatch: pytest.MonkeyPatch, environment: dict[str, str], expected: str | None
 ) -> None:
     """Also ask gRPC itself, which asks its proxy for the host."""
     for name, value in environment.items():
-        monkeypatch.setenv(name, value and proxy.url)
+        monkeypatch.setenv(name, value)
     assert grpc_proxy("grpc://server.lab:8001") == expected
     assert grpc_proxy("grpc://localhost:8001") is grpc_proxy("http://server.lab:8000") is None
+    for name, value in environment.items():
+        if value and "no_" not in name:
+            monkeypatch.setenv(name, proxy.url)
     with RewardClient("grpc://server.lab:8001", retry=False, timeout_s=10.0) as client:
         assert client.is_ready() == bool(proxy.asked) == (expected is not None)
 

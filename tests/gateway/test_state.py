@@ -56,6 +56,8 @@ def test_gpu_status_counts_each_request_once(encoders: Gateway, tiny: Gateway, t
     computed_s = sum(model.busy_ms for model in models if model.name in (ENCODERS, f"{ENCODERS}_encoder")) / 1e3
     assert busy_s < work_done(encoders)[1] == pytest.approx(computed_s, rel=0.01)
     assert work_done(tiny) == of_other
+    # Triton measures devices for the first time after two seconds.
+    wait_for(lambda: requests.get(f"{encoders.url}/gpu_status").json()["gpu_stats"]["0"]["memory_used_bytes"])
     status = requests.get(f"{encoders.url}/gpu_status").json()
     (stats,) = status.pop("gpu_stats").values()
     assert status == {"total_gpus": 1, "available_gpus": 1, "max_workers": 1, "pool_size": 1}

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Server addresses: URLs, listen addresses, certificate files (PEM), and proxies set in the environment.
 
-Calls to this machine use no proxy. For other hosts gRPC and urllib decide, each from its own variables. The client's
-HTTP transport uses no proxy.
+Calls to this machine use no proxy. For other hosts gRPC and urllib decide, each from its own variables. This module
+repeats their rules for error messages. The client's HTTP transport uses no proxy.
 """
 
 from __future__ import annotations
@@ -130,18 +130,51 @@ class ListenAddress:
 
 
 _PROXY_VARIABLES = ("grpc_proxy", "https_proxy", "http_proxy")  # the first one set counts, even if empty
+_NO_PROXY_VARIABLES = ("no_grpc_proxy", "no_proxy")
+_CREDENTIALS = re.compile(r"[^/@]*@")
 
 
 def grpc_proxy(url: str) -> str | None:
-    """Return the variable that names gRPC's proxy for other hosts than those in ``no_proxy``; None: no proxy."""
+    """Return ``VARIABLE=VALUE`` for the proxy that gRPC uses for the server, without a password; None: no proxy."""
     scheme, address = split_url(url)
-    name = next((name for name in _PROXY_VARIABLES if name in os.environ), None)
-    is_for_others = name is not None and os.environ[name] and scheme.startswith("grpc")
-    return name if is_for_others and not is_loopback(host_of(address)) else None
+    name, value = next(((name, os.environ[name]) for name in _PROXY_VARIABLES if name in os.environ), ("", ""))
+    if not value or not scheme.startswith("grpc") or is_loopback(host_of(address)):
+        return None
+    excepted = next((os.environ[name] for name in _NO_PROXY_VARIABLES if name in os.environ), "")
+    if any(_covers(entry.strip(), host_of(address)) for entry in excepted.split(",") if entry.strip()):
+        return None
+    return _shown(name, value)
+
+
+def with_proxy(url: str) -> str:
+    """Return the server's URL for an error message, with gRPC's proxy if there is one."""
+    proxy = grpc_proxy(url)
+    return f"{url} through {proxy}" if proxy else url
 
 
 def open_url(url: str, timeout_s: float) -> Any:
     """Open the URL and return the response. Raises OSError or HTTPException."""
-    proxies = urllib.request.ProxyHandler({} if is_loopback(urlsplit(url).hostname or "") else None)
-    # a new opener, because urlopen keeps the proxies from its first call
-    return urllib.request.build_opener(proxies).open(url, timeout=timeout_s)
+    scheme, host = urlsplit(url).scheme, urlsplit(url).hostname or ""
+    proxies = urllib.request.ProxyHandler({} if is_loopback(host) else None)
+    try:  # a new opener, because urlopen keeps the proxies from its first call
+        return urllib.request.build_opener(proxies).open(url, timeout=timeout_s)
+    except OSError as error:
+        proxy = urllib.request.getproxies().get(scheme)
+        if not proxy or is_loopback(host) or urllib.request.proxy_bypass(host):
+            raise
+        raise OSError(f"{error} (through {_shown(f'{scheme}_proxy', proxy)})") from error
+
+
+def _covers(entry: str, host: str) -> bool:
+    """True if a no_proxy entry covers the host by gRPC's rules: a name's ending, or a network (CIDR)."""
+    if host.lower().endswith(entry.lower()):
+        return True
+    try:
+        return "/" in entry and ipaddress.ip_address(host) in ipaddress.ip_network(entry, strict=False)
+    except ValueError:
+        return False
+
+
+def _shown(name: str, value: str) -> str:
+    """``VARIABLE=VALUE`` for an error message, without the password."""
+    return f"{name}={_CREDENTIALS.sub('***@', value)}"

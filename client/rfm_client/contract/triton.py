@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection
 from typing import Any, TypeAlias, TypeVar
 
 from rfm_client.contract import errors
-from rfm_client.contract.addresses import grpc_proxy
+from rfm_client.contract.addresses import grpc_proxy, with_proxy
 from rfm_client.contract.wire import GOAL, NUM_FRAMES, SECOND_FRAMES, VIEWS, frames_name
 
 BadRequest: TypeAlias = Callable[[str], errors.RewardError]
@@ -108,7 +108,7 @@ def error_from(raised: Exception, url: str, bad_request: BadRequest = invalid_sa
             case "InferenceServerException":
                 return _error_of_answer(raised, url, bad_request)
             case "TimeoutError":  # in Python 3.10 asyncio has its own class
-                return errors.DeadlineExceededError(f"{url}: no answer in time")
+                return errors.DeadlineExceededError(f"{with_proxy(url)}: no answer in time")
             case "SSLError" | "ClientSSLError":
                 return denied(url, "", str(raised))
             case "ClientResponseError":
@@ -180,9 +180,9 @@ def unreachable(url: str, reason: str) -> errors.ServerUnavailableError:
     reason, remedy = (found[1] if found else reason), _START
     if url.startswith("grpc") and _NO_GRPC.search(reason):
         reason, remedy = "no answer of Triton's gRPC port (by default 8001)", _GRPC_PORT
-    if proxy := grpc_proxy(url):
-        remedy += f"; or add the host to no_proxy, unless {proxy} names the proxy that leads to it"
-    return _with_remedy(errors.ServerUnavailableError, f"{url}: no connection: {reason}", remedy)
+    if grpc_proxy(url):
+        remedy += "; or add the host to no_proxy, unless this proxy leads to it"
+    return _with_remedy(errors.ServerUnavailableError, f"{with_proxy(url)}: no connection: {reason}", remedy)
 
 
 def not_served(model: str, message: str, served: Collection[str]) -> errors.ModelNotFoundError:

@@ -3,22 +3,27 @@
 
 from __future__ import annotations
 
+import asyncio
+import logging
+import math
 import os
-from collections.abc import Awaitable, Callable, Collection, Mapping
-from contextlib import nullcontext, suppress
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
+from contextlib import asynccontextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from typing import Any, ClassVar, Protocol, TypeVar
 
-from tritonclient.utils import np_to_triton_dtype
+from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 from rfm_client.contract import errors, triton
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.wire import Tensors
-from rfm_client.transport.connection import SECURE_SCHEMES, Credentials, grpc_options
+from rfm_client.transport.connection import SECURE_SCHEMES, SILENT_S, Credentials, grpc_options
 from rfm_client.transport.limits import check_size, timeout
 from rfm_client.transport.shared_memory import Region, SharedMemory
 from rfm_client.transport.threads import off_loop
@@ -27,6 +32,8 @@ Answered = TypeVar("Answered")
 
 _US_PER_S = 1_000_000
 _SERVED_TIMEOUT_S = 2.0  # for listing served models in an error
+
+logger = logging.getLogger("rfm_client")
 
 
 @dataclass(frozen=True)
@@ -79,7 +86,10 @@ class TritonTransport:
         if self._credentials.uses_tls and self._scheme not in SECURE_SCHEMES:
             raise InvalidValueError.at("url", "grpcs:// or https:// with certificates", url)
         self._shared_memory = SharedMemory(url) if shared_memory else None
-        self._client: Any = None  # tritonclient's
+        self._client: Any = None  # tritonclient's, for the next call
+        self._calls: Counter[Any] = Counter()  # by client; an earlier client closes after its last call
+        self._silent_since_s: dict[Any, float] = {}  # by client: its first call since the last answer
+        self._is_triton = self._is_grpc  # False: may be the metrics port
 
     @cached_property
     def _triton(self) -> Any:
@@ -117,8 +127,10 @@ class TritonTransport:
     async def is_ready(self, model: str, timeout_s: float) -> bool:
         async def request(client: Any) -> bool:
             is_ready = bool(await client.is_server_ready() and await client.is_model_ready(model))
-            if is_ready and not self._is_grpc:
-                await client.get_server_metadata()  # Triton's metrics port says that everything is ready
+            if is_ready and not self._is_triton:  # Triton's metrics port says over HTTP that everything is ready
+                with suppress(InferenceServerException, errors.InferenceFailedError):  # it refuses nothing
+                    await client.get_server_metadata()
+                self._is_triton = True
             return is_ready
 
         try:
@@ -129,10 +141,11 @@ class TritonTransport:
     async def close(self) -> None:
         try:
             if self._shared_memory is not None:
-                await self._shared_memory.close(self._connected())
+                async with self._connected() as client:
+                    await self._shared_memory.close(client)
         finally:
-            if self._client is not None:
-                await self._client.close()
+            for client in [*self._calls]:
+                await client.close()
 
     def _inputs(self, inputs: Tensors, regions: Mapping[str, Region]) -> list[Any]:
         tensors = []
@@ -160,8 +173,8 @@ class TritonTransport:
         """
         try:
             # One limit for gRPC and HTTP. Triton drops a cancelled gRPC call, unless scoring has begun.
-            async with timeout(timeout_s):
-                return await request(self._connected())
+            async with timeout(timeout_s), self._connected() as client:
+                return await request(client)
         except errors.RewardError:
             raise
         except Exception as raised:
@@ -175,16 +188,36 @@ class TritonTransport:
     async def _not_served(self, model: str, error: errors.ModelNotFoundError) -> errors.ModelNotFoundError:
         """Return the error with the served models' names, if the server lists them in time."""
         with suppress(Exception):
-            async with timeout(_SERVED_TIMEOUT_S):
-                statistics = await self._connected().get_inference_statistics(**self.as_json)
+            async with timeout(_SERVED_TIMEOUT_S), self._connected() as client:
+                statistics = await client.get_inference_statistics(**self.as_json)
                 served = {each["name"] for each in statistics.get("model_stats", [])}
                 return triton.not_served(model, error.message, served)
         return error
 
-    def _connected(self) -> Any:
-        if self._client is None:
-            self._client = self._open()
-        return self._client
+    @asynccontextmanager
+    async def _connected(self) -> AsyncIterator[Any]:
+        """Lend the client to a call. If the call is cancelled on a silent connection, later calls get a new one."""
+        client = self._client = self._client or self._open()
+        self._calls[client] += 1
+        self._silent_since_s.setdefault(client, time.monotonic())
+        try:
+            yield client
+            self._silent_since_s.pop(client, None)
+        except InferenceServerException:  # an answer, or gRPC has noticed that the connection ended
+            self._silent_since_s.pop(client, None)
+            raise
+        except asyncio.CancelledError:
+            silent_s = time.monotonic() - self._silent_since_s.get(client, math.inf)
+            if client is self._client and silent_s >= SILENT_S:
+                logger.info("%s: nothing comes over the connection: the next call gets a new one", self.url)
+                self._client = None
+            raise
+        finally:
+            self._calls[client] -= 1
+            if client is not self._client and not self._calls[client]:
+                await client.close()
+                del self._calls[client]
+                self._silent_since_s.pop(client, None)
 
     def _open(self) -> Any:
         """Return a client with tritonclient's methods. It connects at first use and sends the credentials."""

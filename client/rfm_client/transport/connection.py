@@ -2,12 +2,15 @@
 """Options and credentials of a connection.
 
 A firewall or a lost machine drops packets without an error. Over gRPC all calls share one connection, so every call
-would run into its deadline. A request whose bytes the peer does not acknowledge within UNACKNOWLEDGED_MS ends the
-connection instead, and is sent again over a new one. The kernel enforces this (TCP_USER_TIMEOUT, which gRPC sets where
-keepalive is on).
+would run into its deadline. Two rules open a new connection instead:
 
-Pings do not suffice. Triton closes a connection after more than two pings less than 300 s apart during which it sends
-nothing, as in a long call. So gRPC pings at most every PING_MS, and only during a call.
+- A request whose bytes the peer does not acknowledge within UNACKNOWLEDGED_MS ends the connection, and is sent again.
+  The kernel enforces this (TCP_USER_TIMEOUT, which gRPC sets where keepalive is on).
+- If a call runs into its deadline and nothing has arrived for SILENT_S, later calls get a new connection. This covers
+  peers that acknowledge bytes but do not answer, such as a proxy that hangs.
+
+Pings alone do not suffice. Triton closes a connection after more than two pings less than 300 s apart during which it
+sends nothing, as in a long call. So gRPC pings at most every PING_MS, and only during a call.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ from rfm_client.contract.settings import ConfigError
 
 PING_MS = 330_000
 UNACKNOWLEDGED_MS = 10_000
+SILENT_S = 1.0
 
 _UNBOUNDED = -1
 GRPC_OPTIONS: dict[str, int | str] = {

@@ -18,8 +18,9 @@ from rfm_client.contract.checks import checked_count, checked_positive
 from rfm_client.contract.errors import DeadlineExceededError, InvalidSampleError
 from rfm_client.contract.wire import Tensors
 
-MAX_REQUEST_BYTES = 2**31 - 2**16  # gRPC and Triton's HTTP server count message bytes in 32 bits; rest: headers, texts
+MAX_REQUEST_BYTES = 2**31 - 2**16  # gRPC and Triton's HTTP server count message bytes in 32 bits; rest: headers
 _BYTES_PER_GB = 1e9
+_LENGTH_BYTES = 4  # before every text
 MAX_BYTES = 256 * 2**20  # input bytes; writing to a socket holds several copies
 MAX_TIMEOUT_S = 1e9  # more than 30 years; Triton counts nanoseconds, and not many more
 
@@ -59,7 +60,11 @@ def check_size(inputs: Tensors, shared: Collection[str]) -> None:
 
     shared: names of inputs in shared memory
     """
-    sizes = {name: array.nbytes for name, array in inputs.items() if name not in shared}
+    sizes = {
+        name: sum(len(text) + _LENGTH_BYTES for text in array.flat) if array.dtype == object else array.nbytes
+        for name, array in inputs.items()
+        if name not in shared
+    }
     if sum(sizes.values()) <= MAX_REQUEST_BYTES:
         return
     raise InvalidSampleError.at(

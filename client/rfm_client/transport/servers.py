@@ -22,6 +22,7 @@ import time
 from collections.abc import Awaitable, Callable, Collection, Sequence
 from typing import TypeVar
 
+from rfm_client.contract.addresses import with_proxy
 from rfm_client.contract.checks import require
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import (
@@ -81,15 +82,16 @@ class KnownServer:
         finally:
             self.outstanding -= 1
 
-    async def back(self, model: str, rest_s: float) -> None:
-        """Wait until the server is ready after ``rest_s``, or ready after it has reported not ready."""
-        until_s, was_down = time.monotonic() + rest_s, False
-        while True:
+    async def back(self, model: str, rest_s: float, restart_s: float) -> None:
+        """Wait for ``rest_s``, then until the server is ready: after ``restart_s``, or after it reported not ready."""
+        await asyncio.sleep(rest_s)
+        until_s = time.monotonic() + restart_s
+        for attempt in itertools.count():
             is_ready = await self.transport.is_ready(model, PROBE_TIMEOUT_S)
-            if is_ready and (was_down or time.monotonic() >= until_s):
+            if is_ready and time.monotonic() >= until_s:
                 return
-            was_down = was_down or not is_ready
-            await asyncio.sleep(_POLL_S)
+            until_s = until_s if is_ready else 0.0
+            await asyncio.sleep(pause_s(attempt, LONGEST_PAUSE_S if rest_s else _POLL_S))
 
     async def close(self) -> None:
         """Close the connection, even if calls still use it."""
@@ -215,7 +217,7 @@ class Servers:
                 failed = failures.get(server)
                 if failed is not None and left_s < deadline.timeout_s / 2:
                     raise failed from failed.__cause__  # this failure took most of the time
-                raise deadline.exceeded(server.transport.url) from error
+                raise deadline.exceeded(with_proxy(server.transport.url)) from error
             except (AccessDeniedError, InferenceFailedError, ModelNotFoundError) as error:
                 refusals[server] = error
                 if not self._retry:
@@ -266,15 +268,10 @@ class Servers:
         if server.is_left_out or self._is_closed:
             return  # the same failure, or closing
         server.failures += 1
-        if isinstance(error, ProcessEndedError):
-            rest_s = RESTART_S  # Triton 2.51 reports a dead model as ready
-        elif error.may_have_ended_server:
-            rest_s = 0.0
-        elif len(self._servers) > 1:
-            rest_s = pause_s(server.failures - 1, LONGEST_REST_S)
-        else:
-            return
-        server.comeback = asyncio.create_task(server.back(model, rest_s))
+        if error.may_have_ended_server or len(self._servers) > 1:
+            rest_s = 0.0 if error.may_have_ended_server else pause_s(server.failures - 1, LONGEST_REST_S)
+            restart_s = RESTART_S if isinstance(error, ProcessEndedError) else 0.0  # Triton 2.51: the dead are ready
+            server.comeback = asyncio.create_task(server.back(model, rest_s, restart_s))
 
 
 def _is_task_cancelled() -> bool:

@@ -39,10 +39,10 @@ logger = logging.getLogger("rfm_client")
 
 
 class Region:
-    """Memory that the server also maps."""
+    """Memory that the server also maps. generation: how many server restarts were noticed before."""
 
-    def __init__(self, name: str, byte_size: int) -> None:
-        self.name, self.byte_size = name, byte_size
+    def __init__(self, name: str, byte_size: int, generation: int) -> None:
+        self.name, self.byte_size, self.generation = name, byte_size, generation
         descriptor = os.open(FOLDER / name, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_CLOEXEC, 0o600)
         try:
             os.posix_fallocate(descriptor, 0, byte_size)  # raises OSError now, where a write would raise SIGBUS later
@@ -72,6 +72,7 @@ class SharedMemory:
         self._url = url
         self._names = (f"rfm-client-{uuid.uuid4().hex}-{number}" for number in itertools.count())
         self._is_usable = True
+        self._generation = 0
         self._free: list[Region] = []
         self._registered: set[str] = set()  # names that the server may map
 
@@ -88,10 +89,9 @@ class SharedMemory:
             await asyncio.shield(writing)
             yield region
         except InferenceServerException as error:
-            if triton.LOST_REGION in (error.message() or ""):  # the server was restarted
-                lost = {region.name, *(each.name for each in self._free)}
+            if triton.LOST_REGION in (error.message() or "") and region.generation == self._generation:
+                self._generation += 1  # the server was restarted, and knows no region
                 self._free.clear()
-                self._registered -= lost
             raise
         finally:
             # After a cancelled call the server may still read the region, but its answer is dropped.
@@ -120,7 +120,7 @@ class SharedMemory:
             await self._unregister(client, self._free.pop().name)
         try:
             size = max(MIN_REGION_BYTES, 1 << (byte_size - 1).bit_length())
-            region = Region(next(self._names), size)
+            region = Region(next(self._names), size, self._generation)
         except OSError as error:
             self._give_up(str(error))
             return None
@@ -144,7 +144,7 @@ class SharedMemory:
             logger.warning("%s: no shared memory, inputs go through the socket: %s", self._url, reason)
 
     def _give_back(self, region: Region) -> None:
-        if region.name in self._registered:
+        if region.generation == self._generation:
             self._free.append(region)
 
     async def _unregister(self, client: Any, name: str) -> None:

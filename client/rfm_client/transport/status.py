@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 from tritonclient.utils import InferenceServerException
 
 from rfm_client.contract import triton
-from rfm_client.contract.addresses import open_url, split_url
+from rfm_client.contract.addresses import open_url, split_url, with_proxy
 from rfm_client.contract.errors import DeadlineExceededError
 from rfm_client.contract.wire import encoder_name, frames_name
 from rfm_client.transport.calls import TritonTransport
@@ -181,7 +181,7 @@ class ServerStatus:
         try:
             version, is_ready, models = await _state(url, timeout_s, credentials)
         except DeadlineExceededError as late:
-            raise DeadlineExceededError(f"{url}: no answer within {timeout_s:g} s") from late
+            raise DeadlineExceededError(f"{with_proxy(url)}: no answer within {timeout_s:g} s") from late
         metrics, fault = await asyncio.to_thread(_read_metrics, metrics_url, timeout_s)
         read = tuple(_model(entry, done, {*models}, metrics) for entry, done in models.values())
         return cls(url, version, is_ready, read, metrics_url, fault, _devices(metrics))
