@@ -183,12 +183,11 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         outcomes = await self._scorer.outcomes(samples, self._call(options))
         return outcomes if return_errors else results_of(outcomes, "samples[{}]" if len(samples) > 1 else "")
 
-    async def score_steps(self, asked: Sequence[Asked], asked_s: float, timeout_s: float | None) -> list[StepScore]:
-        """Score episodes at the steps asked for, with as few requests as possible. Raises RewardError.
-
-        asked_s: when the caller began to wait, by ``time.perf_counter``
-        """
-        return await self._steps.scores(asked, self._call({"timeout_s": timeout_s}), asked_s)
+    async def _score_steps(self, asked: Sequence[Asked], deadline: Deadline) -> list[StepScore]:
+        """Score episodes at the steps asked for, with as few requests as possible. Raises RewardError."""
+        call = self._call({})
+        call.deadline = deadline
+        return await self._steps.scores(asked, call)
 
     async def encode(
         self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None

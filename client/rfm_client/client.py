@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 import weakref
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future
@@ -24,6 +23,7 @@ from rfm_client.episodes.steps import Steps
 from rfm_client.frames.fit_to_checkpoint import snapshot
 from rfm_client.frames.sampling import Sampling
 from rfm_client.scoring.samples import CallOptions
+from rfm_client.transport.limits import Deadline
 from rfm_client.transport.threads import Closing, LoopThread, OneProcess
 
 if TYPE_CHECKING:
@@ -118,19 +118,19 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         options: EpisodeOptions fields. Raises ValueError for contradictory options
         """
         where = "" if env is None else f"envs[{checked_count('env', env, least=0)}]"
-        return Episode(Steps(task, EpisodeOptions(**options), where), self._score_steps, self.model_info)
+        return Episode(Steps(task, EpisodeOptions(**options), where), self._begin, self._score_steps, self.model_info)
 
     def score_episodes(self, episodes: Sequence[Episode]) -> list[StepScore]:
         """Score all episodes at their newest frames, with as few requests as possible. Raises RewardError.
 
         Frames come from ``Episode.keep``, and stay in the episodes after a failure.
         """
-        return self._score_steps([each.asked for each in episodes], time.perf_counter(), None)
+        return self._score_steps([each.asked for each in episodes], Deadline(self.timeout_s))
 
     def submit_episodes(self, episodes: Sequence[Episode]) -> Future[list[StepScore]]:
         """Start ``score_episodes`` and return a future at once. Frames kept later do not change the scores."""
         asked = [each.asked for each in episodes]
-        future = self._loop.start(self._client.score_steps(asked, time.perf_counter(), None))
+        future = self._loop.start(self._client._score_steps(asked, Deadline(self.timeout_s)))
         future.add_done_callback(lambda _done: self)
         return future
 
@@ -171,8 +171,12 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         """End running calls, which raise ClientClosedError, close the connections and release shared memory."""
         self._finalizer()
 
-    def _score_steps(self, asked: Sequence[Asked], asked_s: float, timeout_s: float | None) -> list[StepScore]:
-        return self._loop.wait(self._client.score_steps(asked, asked_s, timeout_s))
+    def _begin(self, timeout_s: float | None) -> Deadline:
+        self._loop.check_caller()
+        return Deadline(self.timeout_s if timeout_s is None else timeout_s)
+
+    def _score_steps(self, asked: Sequence[Asked], deadline: Deadline) -> list[StepScore]:
+        return self._loop.wait(self._client._score_steps(asked, deadline))
 
 
 def _close(client: AsyncRewardClient, loop: LoopThread) -> None:

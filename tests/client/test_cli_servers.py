@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
 import socket
@@ -192,6 +193,25 @@ def test_an_option_wins_over_its_variable() -> None:
         result = invoke("status", *options, env=VARIABLE)
         assert result.exit_code == ExitCode.USAGE
         assert f"got {winner}: No such file or directory" in " ".join(result.stderr.split())
+
+
+def test_an_api_key_is_read_once_so_that_a_pipe_will_do(tmp_path: Path) -> None:
+    np.save(tmp_path / "clip.npy", np.zeros((2, 8, 8, 3), np.uint8))
+    pipe, end = os.pipe()
+    os.write(end, b"key")
+    os.close(end)
+    result = invoke(
+        "score",
+        tmp_path / "clip.npy",
+        "--task",
+        "x",
+        "--url",
+        "grpc://127.0.0.1:1",
+        "--api-key-file",
+        f"/dev/fd/{pipe}",
+    )
+    os.close(pipe)
+    assert result.exit_code == ExitCode.UNAVAILABLE, result.stderr
 
 
 def test_a_bad_variable_hurts_no_command_that_does_not_need_it() -> None:

@@ -66,7 +66,7 @@ def test_scores_and_comparisons_fit_a_terminal_and_name_each_file(engines: Engin
     assert {"video", "progress", "success", "frames", "version"} <= words
     assert {word.rpartition("/")[2] for word in words if word.endswith(NAMES)} == set(NAMES)
     words, _ = shown(engines.url, "compare", *videos, "--task", TASK)
-    assert {"P(wins)", "progress", "success", "frames", "swapped"} <= words
+    assert {"rank", "P(wins)", "progress", "success", "frames", "second", "mean", "orders"} <= words
     assert {word.rpartition("/")[2] for word in words if word.endswith(".mp4")} == set(NAMES)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -198,6 +199,24 @@ def test_a_plot_has_a_strip_for_each_video_and_is_drawn_without_scores_too(tmp_p
     frames_shown = (middles - middles[0]) / (middles[-1] - middles[0]) * 11
     np.testing.assert_allclose(frames_shown, [0, 2, 4, 7, 9, 11], atol=0.02)  # they stand at their times
     assert (np.diff(middles) >= float(corners[0][1])).all()
+
+
+@pytest.mark.parametrize("positions", [[0, 4.9, 5.1, 10], [0, 0.01, 0.02, 0.03, 9], [*range(10), 9.01, 40], [3]])
+def test_frames_of_a_strip_are_even_in_time_so_that_none_is_tiny(positions: list[float]) -> None:
+    times_s = np.array(positions, np.float64)
+    told = FrameScores(progress=np.zeros(len(times_s), np.float32), success=np.zeros(len(times_s), np.float32))
+    shown = Panel.of("", told, np.zeros((len(times_s), 8, 8, 3), np.uint8), times_s).strip_positions
+    assert shown[-1] == times_s[-1]
+    assert (np.diff(shown) >= np.ptp(times_s) / 15).all()
+
+
+def test_without_matplotlib_a_plot_fails_with_the_command_that_installs_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.style", None)
+    told = FrameScores(progress=np.zeros(1, np.float32), success=np.zeros(1, np.float32))
+    with pytest.raises(ImportError, match=r'plots need matplotlib: pip install "\./client\[cli\]"'):
+        plot(tmp_path / "plot.svg", [Panel.of("", told)])
 
 
 ORDERS: dict[str, tuple[dict[tuple[int, int], float], list[int | None], list[int] | None, list[str]]] = {

@@ -139,6 +139,18 @@ BAD_EPISODES: dict[str, tuple[Any, str]] = {
         "observation.state, action",
     ),
     "several tasks": ({TOP: FRAMES, "task": ["a", "b"]}, "task: expected the same at all steps, got 'a' and 'b'"),
+    "a task as text and as numbers": (
+        {TOP: FRAMES, "task": ["1", 1, 1]},
+        "task: expected the same at all steps, got '1' and 1",
+    ),
+    "a task in a list, once": (
+        {TOP: FRAMES, "task": ["a", ["a"]]},
+        "task: expected the same at all steps, got 'a' and ['a']",
+    ),
+    "episodes of several numbers": (
+        {TOP: FRAMES, "episode_index": [[1], [1, 1]]},
+        "episode_index: expected the same at all steps, got [1] and [1, 1]",
+    ),
     "several episodes": (
         [*items(), *items(episode_index=torch.tensor(6))],
         "episode_index: expected the same at all steps, got 5 and 6",
@@ -251,7 +263,7 @@ def test_pictures_are_no_video(tmp_path: Path, kind: str) -> None:
     one.save(tmp_path / "one", kind)
     one.save(tmp_path / "several", kind, **({} if kind == "jpeg" else {"save_all": True, "append_images": others}))
     for name in ("one", "several"):
-        refused = r"expected a video file \(make one of pictures: ffmpeg .*\), got a picture file"
+        refused = r"expected a video file \(make one of pictures: ffmpeg .*\), got a picture file, or several"
         with pytest.raises(InvalidSampleError, match=rf"^video: {refused}"):
             load_trajectory(tmp_path / name)
         with pytest.raises(FrameFileError, match=refused):

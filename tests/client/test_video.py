@@ -74,6 +74,22 @@ def test_a_sound_is_no_video(tmp_path: Path) -> None:
     assert str(refused.value) == f"video: expected a file with a video stream, got none ({tmp_path / 'sound.mp4'})"
 
 
+def test_a_text_is_no_video(tmp_path: Path) -> None:
+    (tmp_path / "text.mp4").write_text("no video")
+    with pytest.raises(InvalidSampleError) as refused:
+        read_video(tmp_path / "text.mp4")
+    expected = "expected a file with a video stream, got a file of another kind, or a damaged one"
+    assert str(refused.value) == f"video: {expected} ({tmp_path / 'text.mp4'})"
+
+
+@pytest.mark.parametrize("url", ["http://host/clip.mp4?a=b", "https://host/clip.npy"])
+def test_a_url_is_to_be_downloaded_first(url: str) -> None:
+    with pytest.raises(InvalidSampleError) as refused:
+        load_trajectory(url)
+    told = "video: expected a video file, got a URL; download it first: curl -LO URL"
+    assert str(refused.value) == f"{told} ({url})"
+
+
 V30_VIDEO = f"videos/{TOP}/chunk-000/file-000.mp4"
 ONE_EPISODE = "video: expected a video of one episode, got a file in the layout of LeRobot v3.0, which holds several: "
 

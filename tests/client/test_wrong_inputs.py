@@ -81,7 +81,7 @@ USAGE = {
     "rfm-client status --url http://a:1 --url http://b:1 --metrics-url http://a:2": (
         "Invalid value: --metrics-url needs a single --url"
     ),
-    "rfm-client compare a.mp4": "Missing argument 'SECOND'.",
+    "rfm-client compare a.mp4": "Invalid value for VIDEO: expected at least 2 videos, got 1",
     "rfm-client sample --num-frames 8-4": bad("--num-frames", "expected a whole number, got '8-4'"),
     "rfm-client --task x score a.mp4": "No such option: --task",
     "rfm-client serve my_models": "No such command 'serve': that is `rfm serve`",

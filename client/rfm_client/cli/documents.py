@@ -24,7 +24,7 @@ from rfm_client.contract.results import (
 )
 from rfm_client.transport.status import ServerStatus
 
-SIDES = ("first", "second")  # in a comparison of two
+SIDES = ("first", "second")  # the JSON names of the two videos, if two are compared
 
 
 def score_document(

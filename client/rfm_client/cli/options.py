@@ -8,7 +8,7 @@ import os
 import shlex
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeAlias
@@ -95,12 +95,11 @@ class ServerOptions(CredentialFiles):
         """The servers and the model, for JSON documents."""
         return {"servers": list(self.urls), "model": self.model}
 
-    def client(self, **options: Any) -> RewardClient:
-        """Return a client. Raises typer.BadParameter for an invalid URL."""
+    def client(self, *urls: str, **options: Any) -> RewardClient:
+        """Return a client for these servers, else for all. Raises typer.BadParameter for an invalid URL."""
         with usage_errors("--url"):
-            return RewardClient(
-                self.urls, model=self.model, **{"timeout_s": self.timeout_s, **self.credentials.options, **options}
-            )
+            given = {"timeout_s": self.timeout_s, **self.credentials.options, **options}
+            return RewardClient(urls or self.urls, model=self.model, **given)
 
     @contextmanager
     def connected(self) -> Iterator[RewardClient]:
@@ -117,7 +116,7 @@ class ServerOptions(CredentialFiles):
 
     def _problem(self, url: str) -> RewardError | None:
         """Return why a server does not score; None: it does."""
-        with replace(self, urls=(url,)).client(retry=False) as client:
+        with self.client(url, retry=False) as client:
             try:
                 try:
                     client.model_info()

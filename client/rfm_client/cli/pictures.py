@@ -14,13 +14,14 @@ import numpy.typing as npt
 
 from rfm_client.contract.results import FRAME_SCORES, SUCCESS_THRESHOLD, FrameScores
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.plot import BOUNDS, COLOURS, GRID, STYLE, THRESHOLD, save
+from rfm_client.plot import BOUNDS, COLOURS, GRID, THRESHOLD, drawing, save
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 ALL_FRAMES = 10  # shown in a strip, if the trajectory has no more
 FEW_FRAMES = 6  # shown in a longer trajectory's strip
+_LEAST_GAP = 0.7  # between a strip's frames, as a share of the mean: frames that do not overlap then stay readable
 WIDTH_IN = 7.0  # page width
 COLUMN_WIDTH_IN = 4.8  # width of panels side by side
 
@@ -72,7 +73,10 @@ class Panel:
         scored = scores.scored_frames
         positions = scored.astype(np.float64) if times_s is None else times_s[scored]
         count = len(positions) if len(positions) <= ALL_FRAMES else FEW_FRAMES
-        shown = np.linspace(0, len(positions) - 1, count).round().astype(int)
+        targets = np.linspace(positions[0], positions[-1], count)
+        shown = np.unique(np.abs(positions - targets[:, None]).argmin(axis=1))
+        gaps = np.diff(positions[shown], append=np.inf)  # after a long gap, the nearest frames may lie together
+        shown = shown[gaps > _LEAST_GAP * np.ptp(positions) / count]
         strip = None if frames is None else frames[scored[shown]]
         return cls(title, scores, positions, "frame" if times_s is None else "s", strip, positions[shown])
 
@@ -82,9 +86,6 @@ def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, colum
 
     columns: panels side by side
     """
-    import matplotlib.style
-    from matplotlib.figure import Figure
-
     panel_in = WIDTH_IN if columns == 1 else COLUMN_WIDTH_IN
     width_in, curves_in = panel_in * columns, panel_in - _LEFT - _RIGHT
     rows = [panels[start : start + columns] for start in range(0, len(panels), columns)]
@@ -93,8 +94,8 @@ def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, colum
     lines = [part for line in (title or "").splitlines() for part in textwrap.wrap(line, most)]
     top_in = 0.1 + (_HEADLINE * len(lines) + 0.04 if lines else 0)
     height_in = top_in + sum(_TITLE + strip_in + _STRIP_GAP + _CURVES + _BELOW for strip_in in strips_in)
-    with matplotlib.style.context([*STYLE]):
-        figure = Figure(figsize=(width_in, height_in))
+    with drawing() as new_figure:
+        figure = new_figure(figsize=(width_in, height_in))
 
         def axes(left_in: float, top_in: float, height: float, **more: Any) -> Axes:
             bottom_in = height_in - top_in - height

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,6 +11,7 @@ from rfm_client.contract.description import FrameSize, ModelInfo
 from rfm_client.episodes.options import StepScore
 from rfm_client.episodes.scorer import Asked
 from rfm_client.episodes.steps import Steps
+from rfm_client.transport.limits import Deadline
 from rfm_client.transport.threads import Closing, OneProcess
 
 
@@ -20,17 +20,19 @@ class Episode(Closing, OneProcess):
 
     It keeps all frames until it ends, because later steps show them again.
 
-    score: scores steps; gets when the caller began to wait, by ``time.perf_counter``, and a time limit
+    begin: returns the deadline for a step that begins now. Raises RuntimeError in a future's callback
+    score: scores steps before a deadline
     model_info: describes the model
     """
 
     def __init__(
         self,
         steps: Steps,
-        score: Callable[[Sequence[Asked], float, float | None], list[StepScore]],
+        begin: Callable[[float | None], Deadline],
+        score: Callable[[Sequence[Asked], Deadline], list[StepScore]],
         model_info: Callable[..., ModelInfo],
     ) -> None:
-        self._score, self._model_info = score, model_info
+        self._begin, self._score, self._model_info = begin, score, model_info
         self._steps = steps
         self._size: FrameSize | None = None  # frames shrink to this size
         self._adding = threading.Lock()
@@ -51,7 +53,7 @@ class Episode(Closing, OneProcess):
         Raises InvalidSampleError; RewardError if the server does not report the size for ``resize``.
         """
         if self.step < 0:
-            self._size = self._frame_size()
+            self._size = self._frame_size(self._steps.options.timeout_s)
         self._steps.frames.append(self._steps.checked(frame, self._size))
 
     def add(self, frame: Any) -> StepScore:
@@ -61,29 +63,33 @@ class Episode(Closing, OneProcess):
 
         Raises RewardError. Then the episode has not grown, and the step may be repeated.
         """
-        asked_s = time.perf_counter()
-        with self._adding:
-            self._size = self._frame_size()
+        deadline = self._begin(self._steps.options.timeout_s)
+        if not self._adding.acquire(timeout=deadline.remaining_s()):
+            raise deadline.exceeded()
+        try:
+            self._size = self._frame_size(deadline.remaining_s())
             steps, new = self._steps, self._steps.checked(frame, self._size)
             steps.frames.append(new)
             try:
-                (score,) = self._score([self.asked], asked_s, steps.options.timeout_s)
+                (score,) = self._score([self.asked], deadline)
                 return score
             except BaseException:
                 steps.frames.remove(new)
                 raise
+        finally:
+            self._adding.release()
 
     def reset(self, task: str | None = None) -> None:
         """Begin a new episode, once no step is open. ``task``: None: as before."""
+        self._begin(None)  # in a callback, the open step would wait for this one
         with self._adding:
             self._steps = self._steps.anew(task)
 
     def close(self) -> None:
         """End the episode. Sends nothing."""
 
-    def _frame_size(self) -> FrameSize | None:
+    def _frame_size(self, timeout_s: float | None) -> FrameSize | None:
         """Return the target size for frames; None: no change. Raises RewardError."""
-        options = self._steps.options
-        if not options.resize:
+        if not self._steps.options.resize:
             return None
-        return self._model_info(frames=True, timeout_s=options.timeout_s).frame_size
+        return self._model_info(frames=True, timeout_s=timeout_s).frame_size

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import random
-import time
 from collections import Counter, OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
@@ -74,15 +73,12 @@ class StepScorer:
         """Describe the model that scores windows. Raises RewardError."""
         return await self._scorer.model_info(self._model, call.deadline)
 
-    async def scores(self, asked: Sequence[Asked], call: Call, asked_s: float) -> list[StepScore]:
-        """Return a score for each step, from as few requests as possible. Raises RewardError, ValueError.
-
-        asked_s: when the caller began to wait, by ``time.perf_counter``
-        """
+    async def scores(self, asked: Sequence[Asked], call: Call) -> list[StepScore]:
+        """Return a score for each step, from as few requests as possible. Raises RewardError, ValueError."""
         info = await self.model_info(call)
         shown = [steps.windows(step, info) for steps, step in asked]
         outcomes = iter(await self._all_outcomes([each for _, windows in shown for each in windows], info, call))
-        ms = (time.perf_counter() - asked_s) * 1e3
+        ms = call.deadline.passed_s * 1e3
         return [
             steps.score(step, prefix, list(islice(outcomes, len(windows))), ms)
             for (steps, step), (prefix, windows) in zip(asked, shown, strict=True)

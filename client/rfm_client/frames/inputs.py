@@ -24,7 +24,7 @@ from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import Trajectory, UInt8Array, as_array, checked_mask, with_pictures
 from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
 from rfm_client.frames.pictures import FrameFileError, Picture, upright_picture
-from rfm_client.frames.video import read_video
+from rfm_client.frames.video import is_url, read_video
 
 _BROKEN_NPY = (  # numpy's errors for a broken .npy header
     *(ValueError, TypeError, LookupError, SyntaxError),
@@ -116,7 +116,7 @@ def as_trajectory(
 
 def _loaded(source: str | Path, *, task: str, correction: Correction, part: Mapping[str, Any]) -> Trajectory:
     """Return the trajectory in one file. Raises InvalidSampleError. part: video part, as in ``read_video``."""
-    if Path(source).suffix.lower() not in ARRAY_SUFFIXES:
+    if is_url(source) or Path(source).suffix.lower() not in ARRAY_SUFFIXES:
         return Trajectory(frames=correction.applied(read_video(source, **part)), task=task)
     for name, value in part.items():
         if value is not None:
@@ -183,10 +183,16 @@ def _columns(steps: Iterable[Mapping[str, Any]]) -> Mapping[str, Any]:
 
 def _only(columns: Mapping[str, Any], key: str, default: Any) -> Any:
     """Return the key's value, equal at all steps, given once or for each step, in any container."""
-    values = as_array(columns[key]).reshape(-1).tolist() if key in columns else [default]
-    for value in values:
-        got = f"{values[0]!r} and {value!r}"
-        require(key, value == values[0], "the same at all steps", got, InvalidSampleError)
+    given = columns.get(key, default)
+    is_by_step = isinstance(given, Sequence) and not isinstance(given, (str, bytes))
+    try:
+        steps = [as_array(step).tolist() for step in (given if is_by_step else [given])]
+    except ValueError as error:  # numpy's, for rows of several lengths
+        raise InvalidSampleError.at(key, "the same at all steps", error) from None
+    for values in (steps, as_array(steps[:1]).reshape(-1).tolist()):
+        for value in values:
+            got = f"{values[0]!r} and {value!r}"
+            require(key, value == values[0], "the same at all steps", got, InvalidSampleError)
     return values[0] if values else default
 
 

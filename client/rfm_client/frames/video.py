@@ -67,6 +67,8 @@ def read_video(
     _check_numbers(fps, start_s, end_s)
     take = take or (lambda num_bytes: None)
     with _errors_of(file):
+        if is_url(file):
+            raise FrameFileError.at("", "a video file", "a URL", "download it first: curl -LO URL")
         video = Video(Path(file), container)
         if start_s is None or end_s is None:
             video.check_is_one_episode()
@@ -83,6 +85,11 @@ def read_video(
             raise FrameFileError.of("frames of one size", "several")
         take(sum(frame.nbytes for frame in frames))
         return np.stack(frames)
+
+
+def is_url(source: str | Path) -> bool:
+    """True for an address instead of a file."""
+    return str(source).lower().startswith(("http:/", "https:/"))  # Path drops a slash
 
 
 def frame_times_s(file: str | Path, num_frames: int, *, container: str | None = None) -> npt.NDArray[np.float64] | None:
@@ -197,13 +204,14 @@ def _decoded(
     try:
         with video.opened() as (container, stream):
             for number, (frame, is_damaged) in enumerate(judged(container.decode(stream))):
-                times_s.append(None if frame.pts is None else float(frame.pts * frame.time_base))
-                is_picked = is_wanted(number, times_s[-1])
+                time_s = None if frame.pts is None else float(frame.pts * frame.time_base)
+                is_picked = is_wanted(number, time_s)
                 take(frame.width * frame.height * _RGB_BYTES if is_picked else 0)
                 if is_picked:
                     if is_damaged:
                         raise InvalidSampleError.at(f"video: frame {number}", UNDAMAGED, DAMAGED)
                     picked.append(upright(frame))
+                times_s.append(time_s)
     except import_av().FFmpegError as error:
         raise FrameFileError.of(f"frame {len(times_s)} to be decoded ({DOWNLOAD})", str(error.strerror)) from error
     return picked, times_s

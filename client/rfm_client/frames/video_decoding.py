@@ -133,7 +133,8 @@ def _check_kind(file: BinaryIO) -> None:
     if pointer := git_lfs_pointer(head):
         raise FrameFileError.of("a video file", pointer)
     if head.startswith(_PICTURES) or head[_WEBP] == b"WEBP":
-        raise FrameFileError.of("a video file (make one of pictures: ffmpeg -i IN OUT.mp4)", "a picture file")
+        got = "a picture file, or several in one (raw Motion JPEG, animated PNG)"
+        raise FrameFileError.of("a video file (make one of pictures: ffmpeg -i IN OUT.mp4)", got)
     is_cut = head.startswith(b"GIF8") and not tail.rstrip(b"\0").endswith(b";")
     for length, offset in _TS_PACKETS:
         syncs = head[offset::length]

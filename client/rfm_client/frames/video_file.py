@@ -71,6 +71,8 @@ class Video:
                 return read_packets(opened, self.container)
         except FileNotFoundError as error:
             raise FrameFileError.of("a video file", "none") from error
+        except import_av().InvalidDataError as error:
+            raise FrameFileError.of("a file with a video stream", "a file of another kind, or a damaged one") from error
         except (import_av().FFmpegError, OSError) as error:
             raise FrameFileError.of("a whole video file", error.strerror or error) from error
 

@@ -114,6 +114,7 @@ class SampleScorer:
         self._servers = servers
         self._concurrency = concurrency
         self._infos: dict[str, ModelInfo] = {}  # until another model version answers
+        self._undescribed: set[str] = set()  # not asked about embeddings again, which they score without a description
         self._checks_lengths = True  # until a trajectory was too long
         self._checks_blank = True  # until a video was blank
 
@@ -127,7 +128,8 @@ class SampleScorer:
             except RewardError as error:
                 outcomes[index] = error.with_traceback(None)
         sent = {index: fit.sample for index, fit in fits.items()}
-        scored = await asyncio.gather(*(self._scored(*group, sent, call) for group in groups(sent, self._model)))
+        calls = [self._scored(*group, sent, call) for group in groups(sent, self._model)]
+        scored = [await calls[0]] if len(calls) == 1 else await asyncio.gather(*calls)  # one needs no task
         for index, outcome in itertools.chain(*scored):
             indices = fits[index].frame_indices
             outcomes[index] = outcome if isinstance(outcome, RewardError) else with_frame_indices(outcome, indices)
@@ -219,7 +221,7 @@ class SampleScorer:
         asked: tuple[str, ...] = (*wire.outputs_for(samples), *call.outputs)
         more: list[str] = []
         try:
-            given = await self._given(model, call) if asks_given else ()
+            given = await self._given(model, samples, call) if asks_given else ()
             more = [name for name in wire.outputs_for(samples, given, all_scores=call.all_scores) if name not in asked]
             answer = await self.infer(model, size, tensors, (*asked, *more), call, request_id)
             return wire.decode_results(answer.tensors, samples, answer.model_version)
@@ -235,12 +237,18 @@ class SampleScorer:
         alone = await asyncio.gather(*(self._request(model, [sample], call) for sample in samples))
         return [outcome for (outcome,) in alone]
 
-    async def _given(self, model: str, call: Call) -> tuple[str, ...]:
+    async def _given(self, model: str, samples: Sequence[Sample], call: Call) -> tuple[str, ...]:
         """Return the names of all scores in the model's description. Raises RewardError."""
+        is_needed = call.all_scores or samples[0].trajectories[0].frames is not None
+        if not is_needed and model in self._undescribed:
+            return ()
         try:
             return (await self.model_info(model, call.deadline)).scores
-        except (ModelNotFoundError, InferenceFailedError):  # the request itself decides
-            return ()
+        except RewardError as error:
+            if is_needed and not isinstance(error, (ModelNotFoundError, InferenceFailedError)):
+                raise
+            self._undescribed.add(model)
+            return ()  # the request itself decides
 
     async def infer(
         self,
@@ -256,11 +264,15 @@ class SampleScorer:
         tensors: makes the inputs, ``num_bytes`` large, when it is the request's turn
         """
         # Make tensors only in turn, so that they do not pile up.
-        async with self._concurrency.room(num_bytes, call.deadline):
-            inputs = await off_loop(num_bytes, tensors)
-            answer = await self._servers.infer(
-                model, inputs, outputs, call.deadline, request_id=request_id, first=call.server
-            )
+        try:
+            async with self._concurrency.room(num_bytes, call.deadline):
+                inputs = await off_loop(num_bytes, tensors)
+                answer = await self._servers.infer(
+                    model, inputs, outputs, call.deadline, request_id=request_id, first=call.server
+                )
+        except RewardError as error:
+            error.request_id = request_id
+            raise
         known = self._infos.get(model)
         if known is not None and known.versions and answer.model_version not in known.versions:
             del self._infos[model]

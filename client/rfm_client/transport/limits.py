@@ -39,6 +39,11 @@ class Deadline:
         self.timeout_s = timeout_s
         self.at_s = time.monotonic() + timeout_s
 
+    @property
+    def passed_s(self) -> float:
+        """The seconds since the call began."""
+        return time.monotonic() - (self.at_s - self.timeout_s)
+
     def ends_within(self, seconds: float) -> bool:
         """True if at most ``seconds`` are left."""
         return time.monotonic() + seconds >= self.at_s

@@ -126,7 +126,7 @@ class Servers:
         request_id: str,
         first: int | None = None,
     ) -> Answer:
-        """Return the named ``outputs`` that ``model`` gives for ``inputs``. Raises RewardError with the request id.
+        """Return the named ``outputs`` that ``model`` gives for ``inputs``. Raises RewardError.
 
         first: index of the server to ask; after a failure, the next in the list. None: the least busy
         """
@@ -134,11 +134,7 @@ class Servers:
         def request(server: Transport, left_s: float) -> Awaitable[Answer]:
             return server.infer(model, inputs, outputs, left_s, request_id=request_id)
 
-        try:
-            return await self._request(model, request, deadline, first)
-        except RewardError as error:
-            error.request_id = request_id
-            raise
+        return await self._request(model, request, deadline, first)
 
     async def model_info(self, model: str, deadline: Deadline) -> ModelInfo:
         """Return a server's description of ``model``. Raises RewardError."""

@@ -156,9 +156,16 @@ class ServerStatus:
     devices: tuple[Device, ...]
 
     @classmethod
-    def read(cls, url: str, **options: Any) -> ServerStatus:
+    def read(
+        cls,
+        url: str,
+        *,
+        metrics_url: str | None = None,
+        timeout_s: float = 60.0,
+        credentials: Credentials | None = None,
+    ) -> ServerStatus:
         """Return ``read_async``'s result outside of an event loop. Arguments and errors are the same."""
-        return asyncio.run(cls.read_async(url, **options))
+        return asyncio.run(cls.read_async(url, metrics_url=metrics_url, timeout_s=timeout_s, credentials=credentials))
 
     @classmethod
     async def read_async(
