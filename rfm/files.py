@@ -37,6 +37,10 @@ PREPROCESSOR_CONFIG = "preprocessor_config.json"  # image preprocessing, beside 
 PIL_BICUBIC = 3  # a value of `resample` in PREPROCESSOR_CONFIG
 MAX_UINT8 = 255
 MAX_JSON_BYTES = 2**24
+MAX_HEADER_BYTES = 2**24  # for a safetensors file; a tensor takes about 100 bytes
+_LENGTH_BYTES = 8  # length field before a safetensors header
+_DTYPES = ("F64", "F32", "F16", "BF16", "I64", "I32", "I16", "I8", "U8", "BOOL")
+_AGAIN = "fetch or copy it again"
 _START_BYTES = 64  # enough to recognise another kind of file
 _KINDS = {
     stat.S_IFDIR: "a folder",
@@ -158,10 +162,11 @@ def read_tensors(file: Path) -> dict[str, Tensor]:
 
     _require(file)
     try:
-        _check_start(file)
+        _check_header(file)
         return load_file(file)
     except (OSError, SafetensorError, *_MISFITS) as error:
-        raise CheckpointError.at(file, "a safetensors file", cut(str(error))) from error
+        remedy = _AGAIN if isinstance(error, SafetensorError) else ""
+        raise CheckpointError.at(file, "a safetensors file", cut(str(error)), remedy) from error
 
 
 def check_one_form(folder: Path) -> None:
@@ -178,14 +183,25 @@ def _require(file: Path) -> None:
         raise CheckpointError.at(file, "a file", "none")
 
 
-def _check_start(file: Path) -> None:
-    """Raise ValueError for what often lies under a safetensors file's name; the library checks the rest."""
+def _check_header(file: Path) -> None:
+    """Check what the library does not: names that come twice, types. Raises ValueError, OSError, RecursionError."""
     with file.open("rb") as content:
-        start = content.read(_START_BYTES)
-    if pointer := git_lfs_pointer(start):
-        raise ValueError(pointer)
-    if start and not any(start):
-        raise ValueError("zeros, as after an unfinished download; fetch or copy it again")
+        start, size = content.read(_START_BYTES), file.stat().st_size
+        if pointer := git_lfs_pointer(start):
+            raise ValueError(pointer)
+        if start and not any(start):
+            raise ValueError(f"zeros, as after an unfinished download; {_AGAIN}")
+        length = int.from_bytes(start[:_LENGTH_BYTES], "little")
+        if size < _LENGTH_BYTES + length or size < _LENGTH_BYTES:
+            raise ValueError(f"only {size} bytes; {_AGAIN}")
+        if length > MAX_HEADER_BYTES:
+            raise ValueError(f"a header of {length} bytes, more than {MAX_HEADER_BYTES}")
+        content.seek(_LENGTH_BYTES)
+        header = json.loads(content.read(length), object_pairs_hook=_once)
+    for name, tensor in header.items() if isinstance(header, dict) else ():
+        dtype = tensor.get("dtype") if isinstance(tensor, dict) and name != "__metadata__" else _DTYPES[0]
+        if dtype not in _DTYPES:
+            raise ValueError(f"{shown(name)} of type {shown(dtype)}, which is none of {', '.join(_DTYPES)}")
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -19,19 +19,24 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
+from google.protobuf.text_format import ParseError
 
 from rfm import published
 from rfm.config import ExportConfig
 from rfm.engine.device import computation
 from rfm.engine.family import NETWORK, Checkpoint, Family, FrameEncoders, config_fields
+from rfm.parameters import CHECKPOINT_FOLDER
 from rfm.published.hub import check_links
 from rfm.published.provenance import Assumption
 from rfm.published.run_config import find_run_config
+from rfm.serve.repository import CONFIG_FILE
 from rfm.weights import num_values
 from rfm_client.contract import ProgressSample
 from rfm_client.contract.description import Description, Origin
 from rfm_client.contract.samples import random_trajectory
 from rfm_export.errors import ExportError
+from rfm_export.layout import description_in
+from rfm_export.pbtxt import parse
 
 Printer: TypeAlias = Callable[[str], object]  # receives a line for the user
 
@@ -92,6 +97,7 @@ def read_for_export(
         say(note)
     gpus = num_gpus(settings)
     origin = published.origin_of(source, folder, computation(checkpoint, settings.torch_dtype, on_gpu=gpus > 0))
+    origin = replace(origin, weights_difference=_earlier_difference(folder))
     _check_graphs(settings, checkpoint.description)
     return Source(
         kind,
@@ -178,6 +184,17 @@ def typical_sample(checkpoint: Checkpoint) -> ProgressSample:
     size_px = (TYPICAL_PX, TYPICAL_PX)
     random = np.random.default_rng(0)
     return ProgressSample(random_trajectory(random, num_frames, description.widths, task=TYPICAL_TASK, size_px=size_px))
+
+
+def _earlier_difference(folder: Path) -> float | None:
+    """Return the difference that an export measured when it wrote this folder; None: not measured, or no export."""
+    kept = folder.parent / CONFIG_FILE  # in the version folder
+    if folder.name != CHECKPOINT_FOLDER or not kept.is_file():
+        return None
+    try:
+        return description_in(parse(kept.read_text())).weights_difference
+    except (ParseError, ValueError):  # exports from before descriptions existed measured nothing
+        return None
 
 
 def origin_in(description: Description) -> Origin:

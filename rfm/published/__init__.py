@@ -100,7 +100,7 @@ def notes(folder: Path, loaded: Loaded, answered: Collection[str] = HEADS) -> li
     without = [f"{WEIGHTS}: there is no head of {' and '.join(missing)}: served without"] if missing else []
     of_weights = constant_heads(loaded.checkpoint.parts[NETWORK], heads)
     of_run = training_notes(folder, heads)
-    return [*without, *of_run, *of_weights, *loaded.notes(), *assumption_lines(loaded.assumptions)]
+    return [*without, *of_run, *of_weights, *loaded.notes(loaded.checkpoint), *assumption_lines(loaded.assumptions)]
 
 
 def origin_of(source: str | Path, folder: Path, computation: str) -> Origin:

@@ -78,7 +78,7 @@ def _fetch(repo_id: str, subfolder: str, tag: str | None, path: Path, say: Calla
         why = str(error) if down in (None, str(error)) else f"{down}, and {error}"
         raise CheckpointError(
             f"{where}: cannot be fetched: {cut(why)}; there is no folder {path.absolute()} either; "
-            f"name one, or see to the Hub's name, login and network"
+            f"name one, or see to the Hub's name, login and network{_cached(repo_id, subfolder)}"
         ) from error
 
 
@@ -129,6 +129,12 @@ def _snapshots(repo_id: str) -> dict[str, Path]:
     refs = [file for file in sorted((home / "refs").rglob("*")) if file.is_file()]
     commits = {str(file.relative_to(home / "refs")): file.read_text().strip() for file in refs}
     return {name: home / "snapshots" / commit for name, commit in commits.items() if _COMMIT.fullmatch(commit)}
+
+
+def _cached(repo_id: str, subfolder: str) -> str:
+    """Name a repository's revisions in the Hub's cache, which need no network."""
+    names = [f"{repo_id}{'/' * bool(subfolder)}{subfolder}@{name}" for name in _snapshots(repo_id)]
+    return f"; without it, name a revision that is in the cache: {', '.join(names)}" if names else ""
 
 
 def _fetch_run_config_of_main(repo_id: str, names: Iterable[str], *, is_down: bool) -> None:

@@ -6,8 +6,10 @@ A module is the name of its weight without ``.weight``, under VlmRewardModel's n
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,7 @@ from rfm.files import (
 )
 from rfm.published.qwen import (
     ADAPTER_NAMES,
+    LORA_INSIDE,
     NF4,
     QWEN_NAMES,
     UNQUANTIZED,
@@ -44,18 +47,24 @@ from rfm.published.rounding import dequantize
 from rfm.published.weights import read_weights, refuse_pickles
 from rfm.qwen.lora import BASE_LAYER, LORA_NAME, MERGE, module_of
 from rfm.qwen.network import BackboneConfig, build_backbone
+from rfm_client.contract.checks import require
 
 WHOLE, TEXT = "model.", "model.language_model."  # what PEFT wraps
 # Factor initialisations that do not change the base model's weights.
 _PLAIN_INITS = (True, False, "gaussian", "orthogonal")
-# Fields of a LoRA configuration with which a weight is W + scaling * B A. Any other field, if set, may change this.
-_PLAIN = {
-    "alpha_pattern", "auto_mapping", "base_model_name_or_path", "bias", "ensure_weight_tying", "exclude_modules",
-    "inference_mode", "init_lora_weights", "layers_pattern", "layers_to_transform", "lora_alpha", "lora_dropout",
-    "megatron_core", "modules_to_save", "peft_type", "peft_version", "qalora_group_size", "r", "rank_pattern",
-    "revision", "runtime_config", "target_modules", "task_type", "use_rslora",
-}  # fmt: skip
-_OF_UPSTREAM = {"peft_vision_encoder"}  # upstream's field in config.yaml
+_PATTERN_S = 5  # for all patterns from an unknown author
+# Fields of a LoRA configuration that PEFT applies, in all versions. A weight is W + scaling * B A.
+_APPLIED = (
+    "alpha_pattern", "exclude_modules", "layers_pattern", "layers_to_transform", "lora_alpha", "modules_to_save", "r",
+    "rank_pattern", "target_modules", "use_rslora",
+)  # fmt: skip
+# Fields that change no score. Any other field, if set, may change the formula above.
+_HARMLESS = (
+    "auto_mapping", "base_model_name_or_path", "bias", "ensure_weight_tying", "inference_mode", "init_lora_weights",
+    "lora_dropout", "megatron_core", "peft_type", "peft_version", "qalora_group_size", "revision", "runtime_config",
+    "task_type",
+    "peft_vision_encoder",  # upstream's, in config.yaml
+)  # fmt: skip
 
 
 def scaled(
@@ -87,23 +96,64 @@ def scaled(
 
 
 def _layers(file: Path, config: Mapping[str, Any], backbone: dict[str, Any], root: str) -> dict[str, Any]:
-    """Return PEFT's layers by module, without weights. Raises CheckpointError for another kind than LoRA."""
-    check_adapter(file, config)
+    """Return PEFT's layers by module, without weights. Raises CheckpointError for patterns that PEFT cannot apply."""
     try:
         from peft import LoraConfig, inject_adapter_in_model
         from peft.tuners.lora import LoraLayer
     except ImportError as error:
-        raise ImportError('LoRA needs PEFT: pip install ".[vlm]"') from error
-    unread = {"init_lora_weights", "runtime_config"} | _OF_UPSTREAM
-    fields = {
-        name: value for name, value in config.items() if name not in unread and not (value is None or value is False)
-    }
+        raise ImportError(f'LoRA needs PEFT: pip install ".[vlm]" ({error})') from error
     with expecting("a configuration that PEFT applies", file):
         with torch.device("meta"):
             network: Any = build_backbone(BackboneConfig(backbone, "bfloat16"), torch.bfloat16)
         wrapped = network if root == WHOLE else network.language_model
+        fields = _without_patterns(file, config, [name for name, _ in wrapped.named_modules() if name])
         inject_adapter_in_model(LoraConfig(**fields), wrapped, low_cpu_mem_usage=True)
     return {root + name: module for name, module in wrapped.named_modules() if isinstance(module, LoraLayer)}
+
+
+def _without_patterns(file: Path, config: Mapping[str, Any], modules: Sequence[str]) -> dict[str, Any]:
+    """Return the fields that PEFT applies, with the names of modules in place of patterns, in bounded time.
+
+    Raises CheckpointError for a pattern that is none, takes too long, or should change the scaling of no module.
+    """
+    import regex  # a dependency of transformers; Python's own has no time limit
+
+    end = time.monotonic() + _PATTERN_S
+
+    def matches(field: str, pattern: str, form: str = "{}") -> list[str]:
+        try:
+            compiled = regex.compile(form.format(pattern))
+            return [each for each in modules if compiled.fullmatch(each, timeout=max(end - time.monotonic(), 1e-3))]
+        except (TimeoutError, regex.error) as error:
+            got, remedy = f"{shown(pattern)}: {error}", "write the names of the modules in its place"
+            raise CheckpointError.at(f"{file}: {field}", "a pattern of names", got, remedy) from error
+
+    fields = {name: config[name] for name in _APPLIED if config.get(name) is not None}
+    for field in ("layers_pattern", "modules_to_save"):  # PEFT takes these as patterns, too
+        names = [fields[field]] if isinstance(fields.get(field), str) else fields.get(field, ())
+        if other := [name for name in names if not re.fullmatch(r"[\w.]*", name)]:
+            raise CheckpointError.at(f"{file}: {field}", "names of modules", shown(other[0]), MERGE)
+    for field in ("target_modules", "exclude_modules"):
+        if isinstance(fields.get(field), str) and fields[field] != "all-linear":
+            fields[field] = matches(field, fields[field])
+    for field in ("alpha_pattern", "rank_pattern"):
+        left, of_module = {*modules}, {}
+        for pattern, value in fields.get(field, {}).items():
+            if not (found := matches(field, pattern, r"(.*\.)?({})$")):
+                remedy = "remove it if it changed none in training, or merge the adapter there"
+                raise CheckpointError.at(
+                    f"{file}: {field}", "patterns of modules", f"{shown(pattern)}, of none", remedy
+                )
+            require(f"{file}: {field}", _is_number(value), "finite numbers", shown(value), CheckpointError)
+            if names := left.intersection(found):  # the first pattern counts
+                of_module[f"^(?:{'|'.join(map(re.escape, sorted(names)))})"] = value
+                left -= names
+        fields[field] = of_module
+    return fields
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def check_adapter(file: Path, config: Mapping[str, Any]) -> None:
@@ -114,35 +164,43 @@ def check_adapter(file: Path, config: Mapping[str, Any]) -> None:
     if kind != "LORA":
         raise CheckpointError.at(f"{file}: peft_type", "LORA", shown(kind), MERGE)
     rank, alpha = config.get("r"), config.get("lora_alpha")
-    if not (rank and alpha):  # PEFT has defaults
-        raise CheckpointError.at(file, "lora_alpha and r of the LoRA weights", f"{shown(alpha)} and {shown(rank)}")
-    if unsupported := sorted(name for name, value in config.items() if value and name not in _PLAIN | _OF_UPSTREAM):
+    if type(rank) is not int or rank < 1 or not _is_number(alpha):  # PEFT has defaults
+        got = f"lora_alpha {shown(alpha)} and r {shown(rank)}"
+        raise CheckpointError.at(file, "lora_alpha and r of the LoRA weights", got)
+    if unsupported := sorted(name for name, value in config.items() if value and name not in (*_APPLIED, *_HARMLESS)):
         raise CheckpointError.at(file, "plain LoRA", cut(", ".join(unsupported)), MERGE)
     if init not in _PLAIN_INITS:
         got = f"{shown(init)}, which may change the base model's weights before training"
         raise CheckpointError.at(f"{file}: init_lora_weights", "true", got, MERGE)
-    if (bias := config.get("bias", "none")) != "none":
+    if bias != "none":
         raise CheckpointError.at(f"{file}: bias", "none", f"{shown(bias)}, which PEFT does not always save", MERGE)
 
 
 def scaled_inside(
-    tensors: Mapping[str, Tensor], folder: Path, backbone: dict[str, Any], file: Path, config: Mapping[str, Any]
+    tensors: dict[str, Tensor], folder: Path, backbone: dict[str, Any], file: Path, config: Mapping[str, Any]
 ) -> dict[str, Tensor]:
-    """Return whole weights, with scaled LoRA factors if there are any among them.
+    """Return whole weights, renamed, with scaled LoRA factors if there are any among them.
 
-    file, config: the run's LoRA configuration, for a folder without PEFT's own
+    file, config: the run's LoRA configuration, with which PEFT's own in the folder must agree
     Raises CheckpointError for a base layer whose factors are missing.
     """
+    root = TEXT if any(name.startswith(f"{TEXT}base_model.") for name in tensors) else WHOLE
+    tensors = renamed(renamed(tensors, LORA_INSIDE), QWEN_NAMES)
     wrapped = {name.partition(BASE_LAYER)[0] for name in tensors if BASE_LAYER in name}
     present = {module_of(name) for name in tensors if LORA_NAME.fullmatch(name)}
     check_none_lost(folder / WEIGHTS, wrapped - present)
     if not present:
-        return {**tensors}
-    if is_there(folder / ADAPTER_CONFIG):
-        file, config = folder / ADAPTER_CONFIG, read_json(folder / ADAPTER_CONFIG)
-    targets = [module.removeprefix(WHOLE) for module in present if module.startswith(_PARTS)]
+        return tensors
+    check_adapter(file, config)
+    if is_there(own := folder / ADAPTER_CONFIG):
+        check_adapter(own, of_adapter := read_json(own))
+        of_run, its = (f"r {each['r']} and lora_alpha {each['lora_alpha']:g}" for each in (config, of_adapter))
+        if of_run != its:
+            raise CheckpointError.at(own, f"{of_run}, as {file} has it", its, "mend the wrong one")
+        file, config = own, of_adapter
+    targets = [module.removeprefix(root) for module in present if module.startswith(_PARTS)]
     used = {name: tensor for name, tensor in tensors.items() if not name.startswith(_UNUSED_HEAD)}
-    return scaled(used, file, {**config, "target_modules": targets}, backbone)
+    return scaled(used, file, {**config, "target_modules": targets}, backbone, root)
 
 
 CUSTOM_HEADS = "custom_heads.safetensors"

@@ -84,8 +84,8 @@ def _loaded(
         given = f"--{kind}-encoder" if option else UPSTREAM_DEFAULT
         whose = "weights of the checkpoint" if weights else "only its width agrees"
         of_encoders.append(Assumption(f"{kind}_encoder", source_name(source), f"{given}; {whose}"))
-    notes, load = partial(_encoder_notes, sources), partial(_encoders, checkpoint, sources)
-    return Loaded(checkpoint, (*assumed, *of_encoders), notes, load)
+    load = partial(_encoders, checkpoint, sources)
+    return Loaded(checkpoint, (*assumed, *of_encoders), lambda _checkpoint: _encoder_notes(sources), load)
 
 
 def _encoder_notes(sources: tuple[str, str]) -> list[str]:

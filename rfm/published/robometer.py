@@ -31,14 +31,11 @@ from rfm.files import (
 from rfm.published.lora import adapted, has_adapter, scaled_inside
 from rfm.published.provenance import Assumption
 from rfm.published.qwen import (
-    LORA_INSIDE,
-    QWEN_NAMES,
     UNQUANTIZED,
     UNUSED,
     backbone_config,
     check_not_quantized,
     decided,
-    renamed,
 )
 from rfm.published.reader import Loaded, Reader
 from rfm.published.robometer_run import (
@@ -78,7 +75,7 @@ def load(folder: Path, options: CheckpointConfig) -> Loaded:
     checkpoint.check()
     if base_model is not None and re.fullmatch(_PUBLISHED_NAMES[config.family], config.base_model_id):
         _check_published(checkpoint.collator, base_model)
-    return Loaded(checkpoint, assumptions, partial(_notes, checkpoint, has_processor=has_processor))
+    return Loaded(checkpoint, assumptions, partial(_notes, has_processor=has_processor))
 
 
 def _check_published(collator: VlmCollator, processor: str) -> None:
@@ -151,7 +148,6 @@ def _trained(folder: Path, content: Mapping[str, Any], base_model: str | None) -
     check_progress(run.sections, run.file)
     if content:
         tensors, num_nf4 = read_published(folder, is_nf4)
-        tensors = renamed(renamed(tensors, LORA_INSIDE), QWEN_NAMES)
         tensors = scaled_inside(tensors, folder, backbone, run.file, run.sections["peft"])
     else:
         backbone, tensors = adapted(folder, base_model or base_of_adapter(folder, run))

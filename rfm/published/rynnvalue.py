@@ -241,7 +241,7 @@ def _published(folder: Path, content: dict[str, Any], options: CheckpointConfig)
     notes = [f"{name}: not expected, and not used: scores may differ from the original's" for name in read.unexpected]
     checkpoint = RynnCheckpoint(config, weights, processor)
     checkpoint.check()
-    return Loaded(checkpoint, (*of_dtype, *read.assumptions), lambda: notes)
+    return Loaded(checkpoint, (*of_dtype, *read.assumptions), lambda _checkpoint: notes)
 
 
 def _descriptions(options: CheckpointConfig) -> dict[str, str]:

@@ -30,7 +30,6 @@ from rfm.qwen.video import Indices, Shot, SizedFrames, VlmVideo
 from rfm_client.contract import InvalidSampleError, Sample, Trajectory
 
 KEPT_TEXTS = 256  # cached conversations; an RL loop repeats the same task
-KEPT_PIECES = 4096  # cached tokens of conversations, and of prompts and times
 MAX_KEPT_BYTES = 16_384  # per conversation text; a task and 128 frames have fewer. A byte is at most one token
 FRAME_BYTES = 64  # chat template text per frame, about
 
@@ -45,10 +44,10 @@ class Visual(Enum):
 class Chat:
     """A base model's chat template and tokenizer, with a cache of recent short conversations."""
 
-    def __init__(self, tokenizer: Any) -> None:
+    def __init__(self, tokenizer: Any, kept_tokens: int = KEPT_TEXTS) -> None:
         self._tokenizer = tokenizer
         self._text = lru_cache(KEPT_TEXTS)(self._render)
-        self._tokens = lru_cache(KEPT_PIECES)(self._tokenise)
+        self._tokens = lru_cache(kept_tokens)(self._tokenise)
 
     def text(self, parts: tuple[str | Visual, ...]) -> str:
         """Return the chat template's text for one user message."""
@@ -91,13 +90,14 @@ class QwenCollator:
     """
 
     makes_trees: ClassVar[bool] = True  # compute the shared beginnings of prefixes once
+    kept_tokens: ClassVar[int] = KEPT_TEXTS  # texts whose tokens are cached: whole conversations
 
     def __init__(self, config: Any, tokenizer: Any, images: QwenImages) -> None:
         self.config = config
         self.tokenizer = tokenizer
         self.images = images
         self._special_tokens = tuple(tokenizer.get_added_vocab())
-        self._chat = Chat(tokenizer)
+        self._chat = Chat(tokenizer, self.kept_tokens)
 
     @property
     def frames_per_shot(self) -> int:

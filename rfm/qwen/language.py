@@ -108,6 +108,8 @@ class LanguageNetwork(nn.Module):
 class LanguageCollator(QwenCollator):
     """The collator for prompts with one video, every temporal patch behind its time."""
 
+    kept_tokens = 4096  # pieces of prompts, and times
+
     def check_template(self) -> None:
         """Raise CheckpointError unless a prompt has its video once."""
         num_videos = self.example().count(VIDEO)

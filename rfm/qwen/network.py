@@ -32,6 +32,7 @@ from rfm.qwen.backbone import (
 )
 from rfm.qwen.batch import VlmBatch
 from rfm.qwen.leaves import Packs
+from rfm_client.contract.checks import require
 
 QWEN_2_5 = "qwen2_5_vl"
 BACKBONES = {QWEN_2_5: "Qwen2_5_VLModel", "qwen3_vl": "Qwen3VLModel"}
@@ -39,6 +40,7 @@ QWEN3 = "qwen3_vl"
 BARE: Final = "bare"
 WRAPPED: Final = "wrapped"
 FULL_ATTENTION = "full_attention"
+MAX_LAYERS = 1024  # more would be made for hours, and no model has them
 Dtype: TypeAlias = Literal["float32", "bfloat16", "float16"]
 
 
@@ -100,13 +102,16 @@ def qwen_states(
 def build_backbone(config: BackboneConfig, dtype: torch.dtype) -> nn.Module:
     """Return the backbone with uninitialised weights in ``dtype``; buffers keep their own dtype.
 
-    Raises CheckpointError for a language model with other layers than full attention.
+    Raises CheckpointError for a language model with other layers than full attention, and for thousands of layers.
     """
     try:
         import transformers
     except ImportError as error:
         raise ImportError('vision-language checkpoints need transformers: pip install ".[vlm]"') from error
     network = getattr(transformers, BACKBONES[config.family])
+    for part, name in (("text_config", "num_hidden_layers"), ("vision_config", "depth")):
+        count = config.backbone[part].get(name, 0)
+        require(f"{part}.{name}", count <= MAX_LAYERS, f"at most {MAX_LAYERS}", count, CheckpointError)
     settings = network.config_class.from_dict(config.backbone)
     with _no_init_weights():
         backbone: nn.Module = network._from_config(settings, dtype=dtype, attn_implementation="sdpa")

@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 import torch
@@ -99,9 +102,16 @@ def with_lora_of_the_language_head(folder: Path) -> None:
     weights(lambda tensors: tensors.update(more))(folder)
 
 
+def in_the_newest_form(folder: Path) -> None:
+    """Fields that no PEFT of this environment knows, without effect."""
+    unset = {"velora_2": None, "later_config": {}, "later_pattern": [], "use_later": False}
+    settings(CONFIG, **unset, peft_version="9.0", ensure_weight_tying=True)(folder)
+
+
 PLAIN_LORA = [name for name in WRITTEN if name.startswith("LoRA")]
 SAME: dict[str, tuple[str, Spoil]] = {
     **{name: (ADAPTER, written(name)) for name in PLAIN_LORA},
+    "with fields of another PEFT": (ADAPTER, in_the_newest_form),
     "PiSSA converted to LoRA": (ADAPTER, both(in_adapter(factors_twice), written("PiSSA converted to LoRA"))),
     "around the language model": (ADAPTER, renamed(r"^base_model\.model\.language_model\.", "base_model.model.", FACTORS)),
     "around the whole model": (LORA_INSIDE, renamed(r"^model\.language_model\.base_model\.model\.", "model.base_model.model.language_model.")),
@@ -303,6 +313,22 @@ REFUSED: dict[str, tuple[str, Spoil, str]] = {
     "factors of two ranks": (LORA_INSIDE, weights(first("lora_B", lambda b: b[:, :-1])), r"expected LoRA factors of one rank, got \[\d+, 3\] and \[4, \d+\]"),
     "a run of another rank": (LORA_INSIDE, run_settings("peft", r=32), r"config\.yaml: r: expected 4, the rows of .*lora_A, got 32; put in r"),
     "a module of another rank": (LORA_INSIDE, weights(of_another_rank), r"r: expected 8, the rows of model\.language_model\.layers\.1\.mlp\.up_proj\.lora_A, got 4"),
+    "a run and an adapter that disagree": (LORA_INSIDE, both(beside_its_adapter, settings(CONFIG, lora_alpha=16)), r"adapter_config\.json: expected r 4 and lora_alpha 8, as .*config\.yaml has it, got r 4 and lora_alpha 16; mend the wrong one"),
+    "a pattern of no module": (ADAPTER, settings(CONFIG, alpha_pattern={"^layers.0": 16}), r"adapter_config\.json: alpha_pattern: expected patterns of modules, got '\^layers\.0', of none; remove it"),
+    **{
+        f"no pattern: {field}": (ADAPTER, settings(CONFIG, **{field: value}), rf"adapter_config\.json: {field}: expected a pattern of names, got '\(q_proj': .*; write the names")
+        for field, value in {"target_modules": "(q_proj", "exclude_modules": "(q_proj", "rank_pattern": {"(q_proj": 4}, "alpha_pattern": {"(q_proj": 4}}.items()
+    },
+    **{
+        f"patterns for names: {field}": (ADAPTER, settings(CONFIG, **{"layers_to_transform": [0], field: [".*"]}), rf"{field}: expected names of modules, got '\.\*'")
+        for field in ("layers_pattern", "modules_to_save")
+    },
+    **{
+        f"alpha: {alpha}": (ADAPTER, settings(CONFIG, lora_alpha=alpha), rf"adapter_config\.json: expected lora_alpha and r of the LoRA weights, got lora_alpha {re.escape(repr(alpha))} and r 4")
+        for alpha in (math.inf, math.nan, True, "8")
+    },
+    "an alpha of a module in words": (ADAPTER, settings(CONFIG, alpha_pattern={"q_proj": "8"}), r"alpha_pattern: expected finite numbers, got '8'"),
+    "a base model of 8 bits": (ADAPTER, beside("base_model", weights(first("q_proj", lambda w: w.to(torch.float8_e4m3fn)))), r"base_model/model\.safetensors: expected a safetensors file, got '.*q_proj.*' of type 'F8_E4M3', which is none of"),
     "an adapter and whole weights": (ADAPTER, empty("model.safetensors"), r"expected an adapter \(adapter_config\.json\) or whole weights \(model\.safetensors\), got both"),
     "whole weights and an adapter without its configuration": (PLAIN, empty(FACTORS), r"expected an adapter \(adapter_model\.safetensors\) or whole weights \(model\.safetensors\), got both"),
     "no embedding": (ADAPTER, in_adapter(first("embed_tokens", None)), r"expected the embedding of the special tokens, got none: their rows .* are lost .*save_embedding_layers=True"),
@@ -320,6 +346,35 @@ def test_an_adapter_that_would_score_otherwise_is_refused(
     spoil(folder)
     with pytest.raises(CheckpointError, match=message):
         load(name, folder, options["base_model"]).build()
+
+
+def test_patterns_are_matched_in_bounded_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, options = with_sources(ADAPTER, tmp_path)
+    settings(CONFIG, target_modules="(a|b|ab)*c")(folder)
+    late = mock.Mock(fullmatch=mock.Mock(side_effect=TimeoutError("regex timed out")))
+    monkeypatch.setattr("regex.compile", lambda pattern: late)
+    expected = r"target_modules: expected a pattern of names, got '\(a\|b\|ab\)\*c': regex timed out; write the names"
+    with pytest.raises(CheckpointError, match=expected):
+        load(ADAPTER, folder, options["base_model"])
+    assert 0 < late.fullmatch.call_args.kwargs["timeout"] <= 5
+
+
+@pytest.mark.parametrize("pattern", ["^layers\\.0\\.mlp", "layers\\.0\\.mlp"])
+def test_patterns_among_whole_weights_begin_where_peft_s_do(tmp_path: Path, pattern: str) -> None:
+    """PEFT wrapped the language model, whose names begin with layers."""
+    folder, _ = with_sources(LORA_INSIDE, tmp_path)
+    beside_its_adapter(folder)
+    settings(CONFIG, alpha_pattern={rf"{pattern}\.\w+": 16, r"\w+_proj": 8})(folder)
+    plain, changed = load(LORA_INSIDE).factors, load(LORA_INSIDE, folder).factors
+    for name, factor in plain.items():
+        times = 2 if "layers.0.mlp" in name and "lora_B" in name else 1
+        torch.testing.assert_close(changed[name], factor * times, rtol=1e-6, atol=0)
+
+
+def test_a_missing_package_of_peft_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "peft", None)
+    with pytest.raises(ImportError, match=r'LoRA needs PEFT: pip install "\.\[vlm\]" \(.*peft'):
+        load(ADAPTER)
 
 
 BASES = {

@@ -87,7 +87,7 @@ REFUSED = {
     "pickles alone": (PICKLED, r"org/pickled@main: expected model\.safetensors, got pytorch_model\.bin: pickles may run code"),
     "pickles alone in a subfolder": (PICKLED_WITHIN, r"org/runs@v1: expected model\.safetensors, got pytorch_model\.bin: pickles"),
     "no such subfolder": (NOT_THERE, r"org/runs@v1: expected the folder none, got none of this name"),
-    "offline, and another revision in the cache": (f"offline {OTHER_TAG}", r"org/name@v9: cannot be fetched: HF_HUB_OFFLINE is set, and the cache has no such revision of it; there is .*; name one"),
+    "offline, and another revision in the cache": (f"offline {OTHER_TAG}", rf"org/name@v9: cannot be fetched: HF_HUB_OFFLINE is set, and the cache has no such revision of it; there is .*; name one, .*; without it, name a revision that is in the cache: org/name@{TAG}, org/name@main$"),
     "offline, and not in the cache": (f"offline {ABSENT}", r"org/absent@v1: cannot be fetched: .*; there is no folder /.*/org/absent/folder@v1 either; name one"),
     "no such repository": (ABSENT, r"^org/absent@v1: cannot be fetched: http://127\.0\.0\.1:\d+ has no such repository, or requires a login "),
     "offline, and known to have no config.yaml": (f"offline {WITHOUT}@{TAG}", r"expected config\.yaml of the training run there"),

@@ -53,7 +53,7 @@ IMAGES, VIDEOS, BOTH = "preprocessor_config.json", "video_preprocessor_config.js
 FIRST = "first_embedding_A"  # tensor in a ReWiND's file
 HEAD, EMBEDDING, TIED = "lm_head.weight", "model.language_model.embed_tokens.weight", "tie_word_embeddings"
 
-MAX_JSON_BYTES = 2**24  # of what is read
+MAX_HEADER_BYTES = MAX_JSON_BYTES = 2**24  # of what is read
 MAX_YAML_BYTES = 2**18
 LONGEST_S = 30
 MOST_MEMORY_BYTES = 512 * 2**20  # above the process's peak
@@ -122,6 +122,16 @@ def header(**changes: object) -> Spoil:
         return json.dumps(content).encode()
 
     return raw_header(change)
+
+
+def twice(raw: bytes) -> bytes:
+    """Name a tensor twice, with another place the second time, which the library would take."""
+    first = json.dumps({FIRST: json.loads(raw)[FIRST]})[1:-1]
+    return raw.replace(b"{", f"{{{first}, ".encode(), 1)
+
+
+def cut_to(length: int) -> Spoil:
+    return lambda folder: (folder / WEIGHTS).write_bytes((folder / WEIGHTS).read_bytes()[:length])
 
 
 def instead(name: str, make: Callable[[Path], object]) -> Spoil:
@@ -199,13 +209,17 @@ WEIGHT_FILES: dict[str, tuple[str, Spoil, str]] = {
     "zeros": (TOP, weights(lambda w: [t.zero_() for t in w.values()]), ZEROS),
     "zeros from half of the file on": (Q3, first_half, ZEROS),
     "a file of zeros": (REWIND, lambda f: (f / WEIGHTS).write_bytes(bytes(1000)), SAFETENSORS + "zeros, as after an unfinished download"),
-    "an empty file": (REWIND, lambda f: (f / WEIGHTS).write_bytes(b""), SAFETENSORS + ".*header too small"),
-    "a header of 2^63 bytes": (REWIND, lambda f: (f / WEIGHTS).write_bytes(struct.pack("<Q", 2**63) + b"{}"), SAFETENSORS + ".*header too large"),
+    "an empty file": (REWIND, lambda f: (f / WEIGHTS).write_bytes(b""), SAFETENSORS + "only 0 bytes; fetch or copy it again"),
+    "a file cut in its header": (REWIND, cut_to(100), SAFETENSORS + "only 100 bytes; fetch or copy it again"),
+    "a file cut in its tensors": (REWIND, cut_to(-100), SAFETENSORS + ".*; fetch or copy it again"),
+    "a header of 2^63 bytes": (REWIND, lambda f: (f / WEIGHTS).write_bytes(struct.pack("<Q", 2**63) + b"{}"), SAFETENSORS + "only 10 bytes"),
+    "a header that fits but is huge": (REWIND, raw_header(lambda _: b"{" + b" " * MAX_HEADER_BYTES + b"}"), SAFETENSORS + f"a header of {MAX_HEADER_BYTES + 2} bytes, more than"),
     "a deep header": (REWIND, raw_header(lambda _: b"[" * 2**20), SAFETENSORS),
-    "a tensor twice": (REWIND, raw_header(lambda raw: raw.replace(b"{", f'{{"{FIRST}": {{}}, '.encode(), 1)), SAFETENSORS),
+    "a tensor twice": (REWIND, raw_header(twice), SAFETENSORS + f"the key '{FIRST}' twice"),
     "offsets beyond the end": (REWIND, header(data_offsets=[0, 2**60]), SAFETENSORS),
     "a shape that lies": (REWIND, header(shape=[1, 1, 10**6]), SAFETENSORS),
-    "a type that is none": (REWIND, header(dtype="PY"), SAFETENSORS + ".*unknown variant `PY`"),
+    "a type that is none": (REWIND, header(dtype="PY"), SAFETENSORS + f"'{FIRST}' of type 'PY', which is none of F64, "),
+    "weights of 8 bits": (REWIND, weights(lambda w: w.update({FIRST: w[FIRST].to(torch.float8_e4m3fn)})), SAFETENSORS + f"'{FIRST}' of type 'F8_E4M3', which is none of"),
     "whole numbers as weights": (REWIND, header(dtype="I32"), rf"{FIRST}: expected numbers like"),
     "a tail": (REWIND, lambda f: (f / WEIGHTS).write_bytes((f / WEIGHTS).read_bytes() + b"tail"), SAFETENSORS),
     "Git LFS": (REWIND, text(WEIGHTS, "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n"), SAFETENSORS + "Git LFS's note of where it is; `git lfs pull` fetches it"),
@@ -287,6 +301,8 @@ BACKBONES: dict[str, tuple[str, Spoil, str]] = {
     "a vision tower with other rotary positions": (Q3, in_json(CONFIG, lambda c: c["vision_config"].update(rope_parameters={"rope_theta": 100.0})), r"vision_config\.rope_parameters: expected axial with a rope_theta of 10000, got {'rope_theta': 100\.0}"),
     "a configuration that is a list": (Q25, settings(CONFIG, text_config=[1]), r"text_config: expected settings of the backbone, got \[1\]"),
     "heads in words": (Q25, text_settings(num_attention_heads="x"), r"expected a backbone that"),
+    "layers without end": (Q25, text_settings(num_hidden_layers=10**9), r"text_config\.num_hidden_layers: expected at most 1024, got 1000000000"),
+    "a vision tower without end": (Q25, in_json(CONFIG, lambda c: c["vision_config"].update(depth=10**9)), r"vision_config\.depth: expected at most 1024, got 1000000000"),
     "a vocabulary that nothing can hold": (Q25, text_settings(vocab_size=10**12), r"embed_tokens\.weight: expected \[1000000000000, \d+\], got"),
     "code of its own": (Q25, settings(CONFIG, auto_map={"AutoConfig": "evil.Config"}, model_type="evil"), r"model_type: expected one of .*, got 'evil', which is not supported"),
     "a quantization in config.json": (Q3, settings(CONFIG, quantization_config={"quant_method": "gptq"}), r"config\.json: quantization_config: expected none, got 'gptq'; export the checkpoint that was quantized"),

@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import shutil
 import sys
+import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 import torch
@@ -26,7 +29,7 @@ from reward_models import ROOT
 from rfm import published
 from rfm.config import ExportConfig
 from rfm.engine import Engine
-from rfm.published import CheckpointError
+from rfm.published import CheckpointError, rounding
 from rfm.published.rounding import dequantize
 from rfm.qwen.rounded import NF4_CODES, Int8Linear, Nf4Linear, RoundedLinear, fit, rounded
 from rfm_client import ModelInfo, ProgressSample
@@ -169,7 +172,7 @@ def test_an_export_holds_the_rounded_weights_and_says_how_far_scores_are(tmp_pat
     second = replace(serve_config(config), base_model=None)
     rfm_export.export(folder / "1" / "checkpoint", tmp_path / "second", second)
     exported_again = info_of(tmp_path / "second" / "rfm_frames")
-    assert (exported_again.weights, exported_again.weights_difference) == (kind, None)  # measured before
+    assert (exported_again.weights, exported_again.weights_difference) == (kind, info.weights_difference)
     assert rfm_export.check(tmp_path / "second", second) == []
 
 
@@ -259,6 +262,29 @@ def test_a_missing_bitsandbytes_is_named_with_its_remedy(monkeypatch: pytest.Mon
     with pytest.raises(CheckpointError, match=expected):
         published.load(**sources(PLAIN), weights="nf4")
     Engine.of(published.load(**sources(PLAIN), weights="int8"))  # which PyTorch decodes
+
+
+def test_a_checkpoint_that_is_rounded_reads_its_processor_once_and_frees_the_full_weights(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from rfm.families.robometer import checkpoint as robometer
+
+    full: list[weakref.ref[Any]] = []
+
+    def rounded_as_asked(checkpoint: Any, kind: Any) -> Any:
+        full.append(weakref.ref(checkpoint))
+        return rounding.rounded_as_asked(checkpoint, kind)
+
+    processor = mock.Mock(wraps=robometer.read_processor)
+    monkeypatch.setattr(robometer, "read_processor", processor)
+    monkeypatch.setattr(published, "rounded_as_asked", rounded_as_asked)
+    options = sources(PLAIN)
+    loaded = published.read(**options, weights="int8")
+    published.notes(Path(options["source"]), loaded)
+    assert loaded.checkpoint.flop(SAMPLES[0]) > 0
+    gc.collect()
+    assert full[0]() is None
+    assert processor.call_count == 1
 
 
 @pytest.mark.parametrize("part", ["weight", "scale"])

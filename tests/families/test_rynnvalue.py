@@ -224,7 +224,7 @@ def test_missing_settings_are_assumed_and_unexpected_keys_are_noted(copied: Path
     loaded = published.read(copied)
     assert loaded.checkpoint.config.attention == "isolated"
     assert [(each.name, each.value) for each in loaded.assumptions] == [("attn_implementation", ISOLATED)]
-    assert loaded.notes() == [
+    assert loaded.notes(loaded.checkpoint) == [
         f"config.json{where}: not expected, and not used: scores may differ from the original's"
         for where in (": 'success_head_config'", ": value_head_config: 'dropout'")
     ]

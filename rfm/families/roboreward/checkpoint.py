@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,11 +14,13 @@ from rfm.engine.execution import Execution
 from rfm.engine.layers import Normalisation, progress_from_logits
 from rfm.engine.predictor import RowScores, no_success
 from rfm.families.roboreward.prompts import SCORES, RoboRewardCollator, RoboRewardConfig, is_unclear, parsed
+from rfm.files import CheckpointError
 from rfm.qwen.batch import VlmBatch, VlmRow
 from rfm.qwen.images import QwenImages
-from rfm.qwen.language import LanguageCheckpoint
+from rfm.qwen.language import LanguageCheckpoint, LanguageCollator
 from rfm.qwen.written import WritingPredictor, WrittenAnswer, unread
 from rfm_client.contract import FrameScores, RewardError
+from rfm_client.contract.checks import require
 from rfm_client.contract.description import Description
 from rfm_client.contract.samples import Float32Array
 
@@ -91,6 +94,14 @@ class RoboRewardCheckpoint(LanguageCheckpoint):
             may_not_answer=not self.config.is_expected,
             uses_graphs=self.config.is_expected,  # a written answer keeps keys and values, whose number grows
         )
+
+    def load_collator(self) -> LanguageCollator:
+        """Return the collator. Raises CheckpointError also for a tokenizer without a token for each score."""
+        collator: Any = super().load_collator()
+        for score, token in zip(SCORES, collator.digits, strict=True):
+            found = collator.tokenizer.decode([token]) == str(score)
+            require(f"base model {self.processor}", found, f"a token for {score}", "none", CheckpointError)
+        return collator
 
     def images(self, patch_px: int, normalisation: Normalisation) -> QwenImages:
         """Return the preprocessing of videos, which keeps large frames large."""

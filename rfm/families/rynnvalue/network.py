@@ -205,10 +205,6 @@ class RynnBatch(VlmBatch):
         values, relatives = (torch.from_numpy(np.ascontiguousarray(each)) for each in found)
         return cls(**vars(batch), values=values, relatives=relatives)
 
-    def _changed(self, change: Callable[[Tensor], Tensor]) -> RynnBatch:
-        own = {"values": change(self.values), "relatives": change(self.relatives)}
-        return RynnBatch(**{**vars(super()._changed(change)), **own})
-
 
 @dataclass(frozen=True)
 class RynnOutput:
