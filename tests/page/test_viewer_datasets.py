@@ -286,7 +286,12 @@ def test_a_dataset_that_changes_to_show_another_file_is_not_read(
 
 BROKEN: dict[str, tuple[str, bytes | None, str, str]] = {  # a file, the content, the requested path, the message
     "no video": (VIDEO, None, OF_VIDEO_0, "file-000.mp4: expected a video file, got none"),
-    "a play list": (VIDEO, b"#EXTM3U\n/etc/passwd\n", OF_VIDEO_0, "expected a file with a video stream, got a file of another kind"),
+    "a play list": (
+        VIDEO,
+        b"#EXTM3U\n/etc/passwd\n",
+        OF_VIDEO_0,
+        "expected a file with a video stream, got a file of another kind",
+    ),
     "another video": (
         VIDEO,
         (LEROBOT / "toy_v30_many" / VIDEO.replace("000.mp4", "002.mp4")).read_bytes(),
