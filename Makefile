@@ -57,7 +57,7 @@ test-newest: $(INSTALLED) $(LEROBOT)
 	$(BIN)/uv venv --quiet --clear --python 3.12 $(VENV)/newest
 	$(UV_SETTINGS) $(BIN)/uv pip install --quiet --python $(VENV)/newest --editable "client[cli,rerun]" --editable apps/gateway \
 	  --editable "apps/labels[hdf5,ray,rlds]" --editable apps/page --editable "apps/rl[sb3]" \
-	  --editable ".[encoders,vlm,quantized,demo,dev]" peft torchrl
+	  --editable ".[encoders,vlm,quantized,demo,dev]" torchrl
 	$(BIN)/python tools/tritonserver.py $(VENV)/newest/server
 	for environment in newest lerobot; do $(BIN)/uv pip list --python $(VENV)/$$environment | grep -E "^($(NEWEST)) "; done
 	PATH=$(CURDIR)/$(VENV)/newest/server:$$PATH $(VENV)/newest/bin/pytest --numprocesses 2 $(WORKERS) \

@@ -21,13 +21,13 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import perf_input
 import report
 from contestants import BareEngine, Contestant, checkpoint
 from load import Load, samples
 
 from rfm.serve.installation import find_installation
 from rfm.serve.triton_server import temporary_server
-from rfm_client.cli.synthetic import write_perf_analyzer_input
 
 WHEEL = "tritonclient==2.51.0"
 LIBRARIES = ("libcudart.so.12", "libb64.so.0d")  # nvidia-pytriton's wheel has them under other names
@@ -60,7 +60,7 @@ def main() -> None:
             Contestant("gRPC", nullcontext(endpoints.grpc_url), measured.widths) as callers,
         ):
             for kind, load in KINDS.items():
-                write_perf_analyzer_input(folder / "requests.json", samples(load, *measured.widths))
+                perf_input.write(folder / "requests.json", samples(load, *measured.widths))
                 command = [str(program), "-m", "rfm", "-u", endpoints.grpc_url.partition("://")[2], *OPTIONS]
                 command += ["--input-data", str(folder / "requests.json")]
                 for number in range(arguments.rounds):

@@ -18,7 +18,7 @@ from rfm.serve.triton_server import stopped_by_signals, temporary_server
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, SimilaritySample, Trajectory
 from rfm_client.cli.pictures import Panel, plot
 from rfm_client.cli.scoring import checkpoint_of, heading
-from rfm_client.cli.show import next_steps, scores_table, steps_with_server
+from rfm_client.cli.show import PAGE_PORT, PAGE_URL, command, next_steps, score_step, scores_table
 from rfm_client.contract.wire import DEFAULT_MODEL
 from rfm_client.frames.inputs import load_trajectory
 from rfm_commands.try_video import steps_without_server
@@ -64,7 +64,8 @@ def demo(
     trajectories = [filmed(clip, output / f"{name}.mp4") for name, clip in Clips.of(seed)._asdict().items()]
     if url is not None:
         show_clips(url, trajectories, output / "rewards.png")
-        steps = steps_with_server(url, [DEFAULT_MODEL])
+        page = command("rfm-client", "gateway", "--port", PAGE_PORT, "--triton", url)
+        steps = next_steps(score_step(url, [DEFAULT_MODEL]), (f"serve the page at {PAGE_URL}", page))
     else:
         with stopped_by_signals(), temporary_server(repository, output / "tritonserver.log") as endpoints:
             show_clips(endpoints.grpc_url, trajectories, output / "rewards.png")

@@ -53,9 +53,13 @@ def rewards(client: RewardClient, policies: Policies, seeds: range) -> tuple[np.
             episode = forward(pick_and_place(scene, grasp_x, release_x, np.random.default_rng(seed)), FRAMES)
             videos.append(render(episode))
             successes.append(episode.success(TASK)[-1])
-    steps = np.stack(videos, axis=1)  # [T, N, H, W, 3]
-    with client.episodes(len(videos), TASK.sentence(), frames=FRAMES) as episodes:
-        progress = np.mean([episodes.add(frames).progress for frames in steps], axis=0)
+    episodes = [client.episode(TASK.sentence(), env=number, frames=FRAMES) for number in range(len(videos))]
+    steps = []
+    for frames in zip(*videos, strict=True):  # one of each video
+        for episode, frame in zip(episodes, frames, strict=True):
+            episode.keep(frame)
+        steps.append([score.progress for score in client.score_episodes(episodes)])
+    progress = np.mean(steps, axis=0)
     shape = len(seeds), len(policies)
     return progress.reshape(shape).mean(axis=0), np.reshape(successes, shape).mean(axis=0)
 

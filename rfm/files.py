@@ -7,7 +7,6 @@ import hashlib
 import json
 import reprlib
 import stat
-import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 
 from rfm.plain_yaml import read_yaml
 from rfm_client.contract.checks import git_lfs_pointer
@@ -39,9 +38,10 @@ PIL_BICUBIC = 3  # a value of `resample` in PREPROCESSOR_CONFIG
 MAX_UINT8 = 255
 MAX_JSON_BYTES = 2**24
 MAX_HEADER_BYTES = 2**24  # for a safetensors file; a tensor takes about 100 bytes
-_LENGTH = struct.Struct("<Q")  # length field before a safetensors header
-_START_BYTES = 64  # enough to recognise another kind of file
+_LENGTH_BYTES = 8  # length field before a safetensors header
 _DTYPES = ("F64", "F32", "F16", "BF16", "I64", "I32", "I16", "I8", "U8", "BOOL")
+_AGAIN = "fetch or copy it again"
+_START_BYTES = 64  # enough to recognise another kind of file
 _KINDS = {
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a pipe",
@@ -165,18 +165,8 @@ def read_tensors(file: Path) -> dict[str, Tensor]:
         _check_header(file)
         return load_file(file)
     except (OSError, SafetensorError, *_MISFITS) as error:
-        raise CheckpointError.at(file, "a safetensors file", cut(str(error))) from error
-
-
-def tensor_names(file: Path) -> list[str]:
-    """Return the tensor names in a safetensors file. Raises CheckpointError."""
-    _require(file)
-    try:
-        _check_header(file)
-        with safe_open(file, "np") as content:
-            return list(content.keys())
-    except (OSError, SafetensorError, *_MISFITS) as error:
-        raise CheckpointError.at(file, "a safetensors file", cut(str(error))) from error
+        remedy = _AGAIN if isinstance(error, SafetensorError) else ""
+        raise CheckpointError.at(file, "a safetensors file", cut(str(error)), remedy) from error
 
 
 def check_one_form(folder: Path) -> None:
@@ -194,19 +184,19 @@ def _require(file: Path) -> None:
 
 
 def _check_header(file: Path) -> None:
-    """Check the header beyond the library's offsets and sizes. Raises ValueError, OSError, RecursionError."""
+    """Check what the library does not: names that come twice, types. Raises ValueError, OSError, RecursionError."""
     with file.open("rb") as content:
-        start = content.read(_START_BYTES)
+        start, size = content.read(_START_BYTES), file.stat().st_size
         if pointer := git_lfs_pointer(start):
             raise ValueError(pointer)
         if start and not any(start):
-            raise ValueError("zeros, as after an unfinished download; fetch or copy it again")
-        if len(start) < _LENGTH.size:
-            raise ValueError(f"only {len(start)} bytes")
-        (length,) = _LENGTH.unpack_from(start)
-        if length > min(MAX_HEADER_BYTES, file.stat().st_size - _LENGTH.size):
-            raise ValueError(f"one whose header would be {length} bytes long")
-        content.seek(_LENGTH.size)
+            raise ValueError(f"zeros, as after an unfinished download; {_AGAIN}")
+        length = int.from_bytes(start[:_LENGTH_BYTES], "little")
+        if size < _LENGTH_BYTES + length or size < _LENGTH_BYTES:
+            raise ValueError(f"only {size} bytes; {_AGAIN}")
+        if length > MAX_HEADER_BYTES:
+            raise ValueError(f"a header of {length} bytes, more than {MAX_HEADER_BYTES}")
+        content.seek(_LENGTH_BYTES)
         header = json.loads(content.read(length), object_pairs_hook=_once)
     for name, tensor in header.items() if isinstance(header, dict) else ():
         dtype = tensor.get("dtype") if isinstance(tensor, dict) and name != "__metadata__" else _DTYPES[0]

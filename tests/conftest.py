@@ -31,6 +31,7 @@ torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"  # of processes that tests start, since other tests need the cores
 os.environ[RUN] = uuid.uuid4().hex  # marks the processes of this run
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test asks the network
+os.environ["HF_HUB_DISABLE_PROGRESS_BARS"] = "1"  # transformers 5 shows one per load, on standard error
 worker, workers = os.getenv("PYTEST_XDIST_WORKER", "gw0"), os.getenv("PYTEST_XDIST_WORKER_COUNT", "1")
 access.PORTS = access.PORTS[int(worker.removeprefix("gw")) :: int(workers)]  # no two workers choose the same port
 os.environ["ONEDNN_MAX_CPU_ISA"] = "AVX512_CORE"  # as the references were computed: AMX rounds bfloat16 elsewhere

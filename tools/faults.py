@@ -18,10 +18,10 @@ import psutil
 
 import rfm_export
 from callers import Callers, Exam, direct, through_gateway
+from commands import is_alive
 from paths import ROOT
 from repositories import answering
 from rfm.config import ExportConfig
-from rfm.serve.processes import has_ended
 from rfm.serve.repository import MODEL_FILE
 from rfm.serve.supervisor import GATEWAY
 from rfm_client import RewardClient
@@ -242,7 +242,7 @@ def kill_serve(site: Site) -> list[Row]:
     """Kill ``rfm serve`` itself. All processes it started end at once, and the next start removes leftovers."""
     processes = psutil.Process(site.served.process.pid).children(recursive=True)
     site.served.process.kill()
-    healed_s = wait_for(lambda: all(has_ended(process.pid) for process in processes))
+    healed_s = wait_for(lambda: not any(is_alive(process.pid) for process in processes))
     with serving(site.folder / "model_repository") as again:
         start_s = again.wait_ready()
     row = Row("kill -9 of rfm serve", None, healed_s, f"{len(processes)} processes ended; started in {start_s:.1f} s")

@@ -38,8 +38,7 @@ PARTS = {
     "rfm/qwen/*.py": VISION_LANGUAGE,
     "rfm/families/robometer/*.py": VISION_LANGUAGE,
     "rfm/published/*.py": f"{VISION_LANGUAGE} families/test_checkpoint.py families/test_missing_heads.py"
-    " families/test_robodopamine.py families/test_hub.py export/test_export.py"
-    " families/test_usual_encoders.py",
+    " families/test_robodopamine.py families/test_hub.py families/test_usual_encoders.py export/test_export.py",
     "rfm/triton_model/batch_model.py": "triton/test_batch_model.py triton/test_pipeline.py",
     "rfm/triton_model/pipeline.py": "triton/test_pipeline.py",
     "client/rfm_client/scoring/batching.py": "contract/test_samples.py client/test_client_servers.py",

@@ -11,32 +11,8 @@ with RewardClient("grpc://localhost:8001") as client:
 import importlib
 import typing
 
-from rfm_client.contract import (
-    FRAME_SCORES,
-    AccessDeniedError,
-    ClientClosedError,
-    DeadlineExceededError,
-    FrameScores,
-    FrameSize,
-    InferenceFailedError,
-    InvalidSampleError,
-    ModelInfo,
-    ModelNotFoundError,
-    PreferenceResult,
-    PreferenceSample,
-    ProcessEndedError,
-    ProgressResult,
-    ProgressSample,
-    Result,
-    RewardError,
-    Sample,
-    ServerError,
-    ServerUnavailableError,
-    SimilarityResult,
-    SimilaritySample,
-    Trajectory,
-    float_frames_to_uint8,
-)
+from rfm_client import contract as _contract
+from rfm_client.contract import *  # noqa: F403
 from rfm_client.contract.samples import Float32Array, UInt8Array, as_array
 
 if typing.TYPE_CHECKING:
@@ -45,38 +21,15 @@ if typing.TYPE_CHECKING:
     from rfm_client.frames.inputs import as_trajectory, load_trajectory
 
 __all__ = [
-    "FRAME_SCORES",
-    "AccessDeniedError",
     "AsyncRewardClient",
-    "ClientClosedError",
-    "DeadlineExceededError",
     "Float32Array",
-    "FrameScores",
-    "FrameSize",
-    "InferenceFailedError",
-    "InvalidSampleError",
-    "ModelInfo",
-    "ModelNotFoundError",
-    "PreferenceResult",
-    "PreferenceSample",
-    "ProcessEndedError",
-    "ProgressResult",
-    "ProgressSample",
-    "Result",
     "RewardClient",
-    "RewardError",
-    "Sample",
-    "ServerError",
-    "ServerUnavailableError",
-    "SimilarityResult",
-    "SimilaritySample",
-    "Trajectory",
     "UInt8Array",
     "as_array",
     "as_trajectory",
-    "float_frames_to_uint8",
     "load_trajectory",
 ]
+__all__ += _contract.__all__
 
 _LATER = {  # imported at first use, because servers need only the contract
     "AsyncRewardClient": "async_client",

@@ -5,23 +5,21 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast, overload
+from typing import TYPE_CHECKING, Literal, cast, overload
 
-from rfm_client.contract.checks import checked_count, require
+from rfm_client.contract.checks import require
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import (
     ClientClosedError,
     DeadlineExceededError,
-    InferenceFailedError,
-    InvalidValueError,
     ModelNotFoundError,
     RewardError,
+    ServerUnavailableError,
 )
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import (
@@ -34,14 +32,12 @@ from rfm_client.contract.samples import (
     with_pictures,
 )
 from rfm_client.contract.wire import DEFAULT_MODEL, PROBE_PREFIX, Part, encoder_name, frames_name
-from rfm_client.episodes.episodes import AsyncEpisode, AsyncEpisodes
-from rfm_client.episodes.options import EpisodeOptions, StepKeywords, StepScore
+from rfm_client.episodes.options import StepScore
 from rfm_client.episodes.scorer import Asked, StepScorer
-from rfm_client.episodes.steps import Steps
 from rfm_client.frames.fit_to_checkpoint import resize_frames
 from rfm_client.frames.sampling import Sampling
 from rfm_client.scoring.samples import Call, CallOptions, SampleScorer, results_of
-from rfm_client.transport.calls import Transport, connect
+from rfm_client.transport.calls import Transport, TritonTransport
 from rfm_client.transport.connection import Credentials
 from rfm_client.transport.limits import ConcurrencyLimiter, Deadline, check_timeout
 from rfm_client.transport.servers import PROBE_TIMEOUT_S, Servers
@@ -104,8 +100,8 @@ PREFIXES_AT_A_TIME = 64  # how many prefixes to hold in memory
 class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     """Client for one or several servers with the same checkpoint, in one event loop.
 
-    ``help(AsyncRewardClient.__init__)`` describes the options. Do not change a sample's arrays while you await the
-    call: a queued request reads them late.
+    ``help(RewardClient)`` describes the calls, ``help(AsyncRewardClient.__init__)`` the options. Do not change a
+    sample's arrays while you await the call: a queued request reads them late.
     """
 
     def __post_init__(self) -> None:
@@ -115,7 +111,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         transports = self.transports
         if not transports:
             urls = [self.urls] if isinstance(self.urls, str) else self.urls
-            transports = [connect(url, shared_memory=self.shared_memory, credentials=credentials) for url in urls]
+            transports = [TritonTransport(url, credentials, shared_memory=self.shared_memory) for url in urls]
         self._servers = Servers(transports, retry=self.retry)
         self._scorer = SampleScorer(self.model, self._servers, ConcurrencyLimiter(self.max_in_flight))
         self._steps = StepScorer(self.model, self._scorer, len(self._servers))
@@ -125,17 +121,13 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def progress(
         self, trajectory: Trajectory, *, frame_steps: int = 0, **options: Unpack[CallOptions]
     ) -> ProgressResult:
-        """Return progress and success at each frame; ``frame_steps`` as in ProgressSample. Raises RewardError."""
+        """Return progress and success at each frame, as ``RewardClient.progress`` does."""
         return cast(ProgressResult, await self.score(ProgressSample(trajectory, frame_steps=frame_steps), **options))
 
     async def preference(
         self, first: Trajectory, second: Trajectory, *, both_orders: bool = False, **options: Unpack[CallOptions]
     ) -> PreferenceResult:
-        """Return the probability that ``first`` does the task better. Raises RewardError.
-
-        both_orders: True: also ask in the other order, since answers may depend on the order; ``preference`` is the
-            mean, and if the orders disagree, ``verdict`` is None. Recommended for labels
-        """
+        """Return the probability that ``first`` does the task better, as ``RewardClient.preference`` does."""
         sample = PreferenceSample(first, second)
         if not both_orders:
             return cast(PreferenceResult, await self.score(sample, **options))
@@ -146,21 +138,13 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def similarity(
         self, reference: Trajectory, other: Trajectory, **options: Unpack[CallOptions]
     ) -> SimilarityResult:
-        """Return a raw score for how similar ``other`` is to ``reference``. Raises RewardError."""
+        """Return how similar ``other`` is to ``reference``, as ``RewardClient.similarity`` does."""
         return cast(SimilarityResult, await self.score(SimilaritySample(reference, other), **options))
 
     async def curve(
         self, trajectory: Trajectory, sampling: Sampling | None = None, **options: Unpack[CallOptions]
     ) -> ProgressResult:
-        """Score every frame as if it were the newest: from that frame and the frames before it.
-
-        sampling: which frames the model sees from a prefix; None: as in the checkpoint's training
-        options: apply to each underlying call; several are needed because the prefixes of a long trajectory exceed
-            memory
-
-        Raises RewardError; ValueError if neither ``sampling`` nor the checkpoint gives a frame count, and for
-        ``subsample``.
-        """
+        """Score every frame as if it were the newest, as ``RewardClient.curve`` does."""
         require("subsample", not options.get("subsample"), "False: the sampling rule chooses the frames", True)
         info = await self.model_info(frames=trajectory.frames is not None, timeout_s=options.get("timeout_s"))
         info.check_scores_prefixes()
@@ -180,7 +164,8 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
 
     async def score(self, sample: Sample, **options: Unpack[CallOptions]) -> Result:
         """Return the result of one sample of any type. Raises RewardError."""
-        return await self._scorer.result(sample, self._call(options))
+        (result,) = results_of(await self._scorer.outcomes([sample], self._call(options)))
+        return result
 
     @overload
     async def evaluate(
@@ -193,49 +178,21 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def evaluate(
         self, samples: Iterable[Sample], *, return_errors: bool = False, **options: Unpack[CallOptions]
     ) -> list[Result] | list[Result | RewardError]:
-        """Score samples in any number and mix; return results in order.
-
-        return_errors: True: return a failed sample's error in place of a result; False: raise the first error,
-            as ``samples[3].num_frames: expected X, got Y``
-        """
+        """Return results for samples in any number and mix, as ``RewardClient.evaluate`` does."""
         samples = list(samples)
         outcomes = await self._scorer.outcomes(samples, self._call(options))
         return outcomes if return_errors else results_of(outcomes, "samples[{}]" if len(samples) > 1 else "")
 
-    def episode(self, task: str, *, env: int | None = None, **options: Unpack[StepKeywords]) -> AsyncEpisode:
-        """Return an episode to score step by step. A step sends only the new frame if the server caches features.
-
-        env: environment index, shown in errors as ``envs[3]``; None: the only one
-        options: EpisodeOptions fields. Raises ValueError for contradictory options
-        """
-        where = "" if env is None else f"envs[{checked_count('env', env, least=0)}]"
-        steps = Steps(task, EpisodeOptions(**options), where)
-        return AsyncEpisode(AsyncEpisodes(self._steps, self._call, [steps]))
-
-    def episodes(self, num: int, task: str | Sequence[str], **options: Unpack[StepKeywords]) -> AsyncEpisodes:
-        """Return ``num`` parallel episodes, as in vectorised environments. A step sends as few requests as possible.
-
-        task: one sentence for all episodes, or one per episode
-        options: as in ``episode``
-        """
-        tasks = [task] * num if isinstance(task, str) else list(task)
-        if len(tasks) != num:
-            raise InvalidValueError.at("task", f"one for each of {num} episodes", len(tasks))
-        each, where = EpisodeOptions(**options), "episodes[{}]" if num > 1 else ""
-        steps = [Steps(sentence, each, where.format(env)) for env, sentence in enumerate(tasks)]
-        return AsyncEpisodes(self._steps, self._call, steps)
-
-    async def score_steps(self, asked: Sequence[Asked]) -> list[StepScore]:
-        """Score episodes at their newest steps, with as few requests as possible. Raises RewardError."""
-        return await self._steps.scores(asked, self._call({}), time.perf_counter())
+    async def _score_steps(self, asked: Sequence[Asked], deadline: Deadline) -> list[StepScore]:
+        """Score episodes at the steps asked for, with as few requests as possible. Raises RewardError."""
+        call = self._call({})
+        call.deadline = deadline
+        return await self._steps.scores(asked, call)
 
     async def encode(
         self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None
     ) -> Trajectory:
-        """Return the trajectory with embeddings instead of frames, for repeated scoring. Raises RewardError.
-
-        The checkpoint must be served with encoders.
-        """
+        """Return the trajectory with embeddings instead of frames, as ``RewardClient.encode`` does."""
         return await self._scorer.embeddings(trajectory, self._call({"timeout_s": timeout_s, "request_id": request_id}))
 
     async def probe(self, model: ModelInfo, *, timeout_s: float | None = None) -> None:
@@ -243,14 +200,13 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         await self.progress(blank_trajectory(model.widths), timeout_s=timeout_s, request_id=PROBE_PREFIX)
 
     async def is_ready(self, *, timeout_s: float | None = None) -> bool:
-        """True if a server answers and has the model ready, for embeddings or for raw frames."""
+        """True if a server has the model ready, as in ``RewardClient.is_ready``."""
         left_s = self._deadline(timeout_s).remaining_s()
         return await self._servers.is_ready((self.model, frames_name(self.model)), left_s)
 
     async def wait_ready(self, timeout_s: float) -> None:
-        """Wait until ``is_ready``. Raises DeadlineExceededError, or ServerUnavailableError for wrong ports."""
+        """Wait until a server has the model ready, as ``RewardClient.wait_ready`` does."""
         deadline = self._deadline(timeout_s)
-        await self._servers.check_ports()
         while deadline.ends_within(0) or not await self.is_ready(
             timeout_s=min(PROBE_TIMEOUT_S, deadline.remaining_s())
         ):
@@ -269,20 +225,12 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def model_info(
         self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None
     ) -> ModelInfo:
-        """Describe the model for embeddings or, with ``frames``, for raw frames.
-
-        refresh: True: ask the server again; False: reuse the description until another model version answers
-
-        Raises ModelNotFoundError if the model is not served.
-        """
+        """Describe the model, as ``RewardClient.model_info`` does."""
         name = frames_name(self.model) if frames else self.model
         return await self._scorer.model_info(name, self._deadline(timeout_s), refresh=refresh)
 
     async def model_infos(self, *, timeout_s: float | None = None) -> dict[Part, list[ModelInfo]]:
-        """Describe the checkpoint's served parts, as reported by every reachable server.
-
-        Raises RewardError if no server answers.
-        """
+        """Describe the checkpoint's served parts, as ``RewardClient.model_infos`` does."""
         deadline = self._deadline(timeout_s)
         infos: dict[Part, list[ModelInfo]] = {}
         for part, name in self.model_names.items():
@@ -302,16 +250,15 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def _why_unready(self) -> str:
         try:
             await self._servers.model_info(frames_name(self.model), Deadline(PROBE_TIMEOUT_S))
-        except (ModelNotFoundError, InferenceFailedError) as error:
+        except ServerUnavailableError as error:
+            return f": {error.fault or error}"
+        except RewardError as error:
             return f": {error}"
-        except RewardError:
-            pass
         return ""
 
     def _call(self, options: CallOptions) -> Call:
         """Return a call that begins now. Raises TypeError for an unknown option."""
-        others: dict[str, Any] = {**options}
-        return Call(self._deadline(others.pop("timeout_s", None)), **others)
+        return Call(self._deadline(options.get("timeout_s")), options)
 
     def _deadline(self, timeout_s: float | None) -> Deadline:
         """Return the deadline for a call that begins now. timeout_s: None: the client's."""

@@ -10,16 +10,20 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 from rfm_client.async_client import AsyncRewardClient, ClientOptions
+from rfm_client.contract.checks import checked_count
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.contract.wire import Part
-from rfm_client.episodes.episodes import Episode, Episodes
-from rfm_client.episodes.options import StepKeywords, StepScore
+from rfm_client.episodes.episodes import Episode
+from rfm_client.episodes.options import EpisodeOptions, StepKeywords, StepScore
+from rfm_client.episodes.scorer import Asked
+from rfm_client.episodes.steps import Steps
 from rfm_client.frames.fit_to_checkpoint import snapshot
 from rfm_client.frames.sampling import Sampling
 from rfm_client.scoring.samples import CallOptions
+from rfm_client.transport.limits import Deadline
 from rfm_client.transport.threads import Closing, LoopThread, OneProcess
 
 if TYPE_CHECKING:
@@ -49,14 +53,23 @@ class RewardClient(ClientOptions, Closing, OneProcess):
     ) -> PreferenceResult:
         """Return the probability that ``first`` does the task better. Raises RewardError.
 
-        both_orders: as in AsyncRewardClient
+        both_orders: True: also ask in the other order, since answers may depend on the order; ``preference`` is the
+            mean, and if the orders disagree, ``verdict`` is None. Recommended for labels
         """
         return self._loop.wait(self._client.preference(first, second, both_orders=both_orders, **options))
 
     def curve(
         self, trajectory: Trajectory, sampling: Sampling | None = None, **options: Unpack[CallOptions]
     ) -> ProgressResult:
-        """Score every frame from the frames up to it, as AsyncRewardClient.curve does. Raises RewardError."""
+        """Score every frame as if it were the newest: from that frame and the frames before it.
+
+        sampling: which frames the model sees from a prefix; None: as in the checkpoint's training
+        options: apply to each underlying call; several are needed because the prefixes of a long trajectory exceed
+            memory
+
+        Raises RewardError; ValueError if neither ``sampling`` nor the checkpoint gives a frame count, and for
+        ``subsample``.
+        """
         return self._loop.wait(self._client.curve(trajectory, sampling, **options))
 
     def similarity(self, reference: Trajectory, other: Trajectory, **options: Unpack[CallOptions]) -> SimilarityResult:
@@ -76,7 +89,8 @@ class RewardClient(ClientOptions, Closing, OneProcess):
     ) -> list[Result] | list[Result | RewardError]:
         """Score samples in any number and mix; return results in order.
 
-        return_errors: True: return a RewardError in place of a failed result; False: raise the first error
+        return_errors: True: return a failed sample's error in place of a result; False: raise the first error,
+            as ``samples[3].num_frames: expected X, got Y``
         """
         samples = list(samples)  # in this thread: an iterator may be slow, or call this client
         return self._loop.wait(self._client.evaluate(samples, return_errors=return_errors, **options))
@@ -103,26 +117,20 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         env: environment index, shown in errors as ``envs[3]``; None: the only one
         options: EpisodeOptions fields. Raises ValueError for contradictory options
         """
-        return Episode(self._client.episode(task, env=env, **options), self._loop, self)
-
-    def episodes(self, num: int, task: str | Sequence[str], **options: Unpack[StepKeywords]) -> Episodes:
-        """Return ``num`` parallel episodes, as in vectorised environments. A step sends as few requests as possible.
-
-        task: one sentence for all episodes, or one per episode
-        options: as in ``episode``
-        """
-        return Episodes(self._client.episodes(num, task, **options), self._loop, self)
+        where = "" if env is None else f"envs[{checked_count('env', env, least=0)}]"
+        return Episode(Steps(task, EpisodeOptions(**options), where), self._begin, self._score_steps, self.model_info)
 
     def score_episodes(self, episodes: Sequence[Episode]) -> list[StepScore]:
         """Score all episodes at their newest frames, with as few requests as possible. Raises RewardError.
 
         Frames come from ``Episode.keep``, and stay in the episodes after a failure.
         """
-        return self._loop.wait(self._client.score_steps([each.asked for each in episodes]))
+        return self._score_steps([each.asked for each in episodes], Deadline(self.timeout_s))
 
     def submit_episodes(self, episodes: Sequence[Episode]) -> Future[list[StepScore]]:
         """Start ``score_episodes`` and return a future at once. Frames kept later do not change the scores."""
-        future = self._loop.start(self._client.score_steps([each.asked for each in episodes]))
+        asked = [each.asked for each in episodes]
+        future = self._loop.start(self._client._score_steps(asked, Deadline(self.timeout_s)))
         future.add_done_callback(lambda _done: self)
         return future
 
@@ -140,7 +148,7 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         return self._loop.wait(self._client.is_ready(timeout_s=timeout_s))
 
     def wait_ready(self, timeout_s: float) -> None:
-        """Wait until ``is_ready``. Raises DeadlineExceededError, or ServerUnavailableError for wrong ports."""
+        """Wait until ``is_ready``. Raises DeadlineExceededError."""
         self._loop.wait(self._client.wait_ready(timeout_s))
 
     def model_info(self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None) -> ModelInfo:
@@ -162,6 +170,13 @@ class RewardClient(ClientOptions, Closing, OneProcess):
     def close(self) -> None:
         """End running calls, which raise ClientClosedError, close the connections and release shared memory."""
         self._finalizer()
+
+    def _begin(self, timeout_s: float | None) -> Deadline:
+        self._loop.check_caller()
+        return Deadline(self.timeout_s if timeout_s is None else timeout_s)
+
+    def _score_steps(self, asked: Sequence[Asked], deadline: Deadline) -> list[StepScore]:
+        return self._loop.wait(self._client._score_steps(asked, deadline))
 
 
 def _close(client: AsyncRewardClient, loop: LoopThread) -> None:

@@ -5,13 +5,13 @@ Needs ``rfm-client[cli]``.
 """
 
 from rfm_client.cli.command import Command, ExitCode, report, with_options
-from rfm_client.cli.options import PlotOutput, ServerOptions
+from rfm_client.cli.options import JsonOutput, ServerOptions
 from rfm_client.cli.show import number, print_table
 
 __all__ = [
     "Command",
     "ExitCode",
-    "PlotOutput",
+    "JsonOutput",
     "ServerOptions",
     "number",
     "print_table",

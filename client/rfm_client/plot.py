@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +29,6 @@ THRESHOLD: dict[str, Any] = {
     "linewidth": 0.9,
     "zorder": 1,
 }  # the line above which success counts
-FAINT = "#4d5761"  # for less important text
 GRID: dict[str, Any] = {"color": "#dde2e6", "linewidth": 0.5, "zorder": 0}
 BOUNDS = (-0.03, 1.03)  # limits for an axis from 0 to 1
 
@@ -65,12 +65,6 @@ def plot_scores(
     times_s = [None] * len(results) if times_s is None else times_s
     for name, values in (("names", names), ("times_s", times_s)):
         require(name, len(values) == len(results), f"{len(results)}, as many as results", len(values))
-    try:
-        import matplotlib.style
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError('plots need matplotlib: pip install "./client[cli]"') from error
-
     positions = [each for each in times_s if each is not None]
     has_times = len(positions) == len(results)
     if not has_times:
@@ -78,11 +72,13 @@ def plot_scores(
     has_success = not all(np.isnan(result.success).all() for result in results)
     scores = [*dict.fromkeys(result.leading for result in results), *["success"] * has_success]
     heights_in = [_SUCCESS_IN if score == "success" else _HEIGHT_IN for score in scores]
-    with matplotlib.style.context([*STYLE]):
-        colours = matplotlib.rcParams["axes.prop_cycle"].by_key()["color"]  # "C0" would follow a style set later
+    with drawing() as new_figure:
+        from matplotlib import rcParams
+
+        colours = rcParams["axes.prop_cycle"].by_key()["color"]  # "C0" would follow a style set later
         columns = 2 if max(map(len, names)) <= _SHORT else 1
         lines_in = _LINE_IN * (-(-len(results) // columns) + 3 + (title or "").count("\n"))
-        figure = Figure(figsize=(_WIDTH_IN, sum(heights_in) + lines_in), layout="constrained")
+        figure = new_figure(figsize=(_WIDTH_IN, sum(heights_in) + lines_in), layout="constrained")
         axes = figure.subplots(len(heights_in), 1, sharex=True, squeeze=False, height_ratios=heights_in)[:, 0]
         for ax, score in zip(axes, scores, strict=True):
             for number, (result, x) in enumerate(zip(results, positions, strict=True)):
@@ -108,11 +104,21 @@ def plot_scores(
     return figure
 
 
+@contextmanager
+def drawing() -> Iterator[type[Figure]]:
+    """Set the style, and yield matplotlib's class for figures. Raises ImportError, naming the extra to install."""
+    try:
+        import matplotlib.style
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError('plots need matplotlib: pip install "./client[cli]"') from error
+    with matplotlib.style.context([*STYLE]):
+        yield Figure
+
+
 def save(figure: Figure, file: Path | str) -> None:
     """Write a figure in the format given by the file suffix, such as .png (200 dots per inch), .pdf or .svg."""
-    import matplotlib.style
-
-    with matplotlib.style.context([*STYLE]), warnings.catch_warnings():
+    with drawing(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph")  # letters missing from the font appear as boxes
         figure.savefig(file)
 

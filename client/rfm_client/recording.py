@@ -7,7 +7,6 @@ Needs ``rfm-client[rerun]``. T frames, H x W pixels.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,15 +48,15 @@ class Recording(Closing):
 
     def add(
         self,
-        entity: Sequence[str],
+        name: str,
         scores: FrameScores,
-        videos: Mapping[str, Iterable[UInt8Array]],
+        frames: UInt8Array | None = None,
         times_s: npt.NDArray[np.float64] | None = None,
     ) -> None:
         """Add a trajectory with its scores.
 
-        entity: parts of its name; empty for the only trajectory in a file
-        videos: by camera, T frames, uint8 [H, W, 3]; a single camera has an empty name; no entries for embeddings
+        name: of its entity
+        frames: uint8 [T, H, W, 3]; None: embeddings
         times_s: float64 [T], frame times in the video; None: unknown
         """
         curves = {curve: getattr(scores, curve) for curve in _COLOURS if not np.isnan(getattr(scores, curve)).all()}
@@ -66,17 +65,15 @@ class Recording(Closing):
             self._stream.reset_time()  # set by this thread's previous trajectory
             for curve in curves:
                 style = self._rerun.SeriesLines(names=curve, colors=_COLOURS[curve])
-                self._log((*entity, curve), style, static=True)
-            for camera, frames in videos.items():
-                for index, frame in enumerate(frames):
-                    self._set_time(index, times_s)
-                    image = self._rerun.Image(frame).compress(jpeg_quality=JPEG_QUALITY)
-                    self._log((*entity, IMAGE, *filter(None, [camera])), image)
+                self._log([name, curve], style, static=True)
+            for index, frame in enumerate(() if frames is None else frames):
+                self._set_time(index, times_s)
+                self._log([name, IMAGE], self._rerun.Image(frame).compress(jpeg_quality=JPEG_QUALITY))
             for position, index in enumerate(scores.scored_frames.tolist()):
                 self._set_time(index, times_s)
                 for curve, values in curves.items():
                     if not np.isnan(values[position]):  # else the model gave no answer for the frame
-                        self._log((*entity, curve), self._rerun.Scalars(float(values[position])))
+                        self._log([name, curve], self._rerun.Scalars(float(values[position])))
 
     def close(self) -> None:
         """Flush the recording to the file."""
@@ -94,5 +91,5 @@ class Recording(Closing):
         else:
             self._stream.set_time(TIME, duration=float(times_s[index]))
 
-    def _log(self, parts: Sequence[str], what: Any, *, static: bool = False) -> None:
-        self._stream.log(list(parts), what, static=static, strict=True)  # by default it only warns about errors
+    def _log(self, entity: list[str], what: Any, *, static: bool = False) -> None:
+        self._stream.log(entity, what, static=static, strict=True)  # by default it only warns about errors

@@ -20,8 +20,7 @@ from rfm.serve.access import Endpoints, new_key, take_key
 from rfm.serve.installation import ServerStartError, find_installation
 from rfm.serve.supervisor import CrashLoopError, GatewayProcess, Supervisor
 from rfm.serve.triton_server import TritonServer, short_spin
-from rfm_client.cli.command import OptionValues, add_missing, with_options
-from rfm_client.cli.messages import MOST_COLUMNS
+from rfm_client.cli.command import MOST_COLUMNS, OptionValues, with_options
 from rfm_client.contract.addresses import from_here
 from rfm_client.contract.process import raise_limit, write_log
 from rfm_client.contract.settings import ConfigError
@@ -203,7 +202,6 @@ def serve(
             gateway=None if beside is None else _gateway_process(beside, config),
             status_port=config.serve.status_port,
             probe_s=config.serve.probe_s,
-            hang_s=config.serve.hang_s,
             triton_silent_s=config.serve.triton_silent_s,
             tell_ready=None if screen is None else screen.show_ready,
         )
@@ -218,7 +216,7 @@ try:
 
     app.command(cls=RfmCommand)(label)
 except ModuleNotFoundError as error:
-    add_missing(app, "label", f"{error.name} is not installed", "labels", "rfm")
+    RfmCommands.missing["label"] = f"{error}: {RfmCommands.missing['label']}"
 app.command("try", cls=RfmCommand)(try_video)
 app.add_typer(models_app, name="models")
 

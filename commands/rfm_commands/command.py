@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, ClassVar, NoReturn
 
 import typer
 
@@ -31,8 +31,9 @@ class RfmCommand(command.Command):
 class RfmCommands(command.Commands):
     """Command group for ``rfm``, which refers to ``rfm-client`` for commands that exist only there."""
 
-    other_program = "rfm-client"
-    others = ("score", "compare", "status", "wait", "sample", "bench-input", "evaluate")
+    program, other_program = "rfm", "rfm-client"
+    elsewhere = ("score", "compare", "status", "wait", "sample", "evaluate")
+    missing: ClassVar[dict[str, str]] = {"label": "pip install ./client ./apps/labels ."}
 
 
 def say(line: str) -> None:
@@ -42,4 +43,5 @@ def say(line: str) -> None:
 
 def fail(message: str) -> NoReturn:
     """Write the message to standard error and exit with 1."""
-    command.fail(message, RfmCommand.program)
+    say(message)
+    raise typer.Exit(command.ExitCode.FAILED)

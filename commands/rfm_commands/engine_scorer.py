@@ -16,7 +16,7 @@ from safetensors import SafetensorError
 
 from rfm import published
 from rfm.engine import Engine
-from rfm.engine.computation import computation
+from rfm.engine.device import computation
 from rfm.engine.execution import Execution
 from rfm.engine.family import Checkpoint, FrameEncoders, config_fields
 from rfm.files import CheckpointError, settings_digest, weights_digest

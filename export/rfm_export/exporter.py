@@ -111,7 +111,9 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
     family = published.choose(folder, config.parameters[FAMILY_PARAMETER].string_value or None)
     checkpoint = families.load(folder, family=family.name)
     description = described(checkpoint, origin)
-    _check_weights(folder, description.weights, settings)
+    if settings.weights not in (None, description.weights):  # a new export would rewrite them
+        remedy, got = "leave out --weights, or export again", description.weights or "full ones"
+        raise ExportError.at(folder, f"weights in {settings.weights}", got, remedy)
     settings = with_batch_size(settings, checkpoint, _nobody)
     encoders = repository / encoder_name(settings.name) / str(number)
     of_encoders = family.encoders.describe(encoders) if family.encoders is not None and encoders.exists() else None
@@ -125,13 +127,6 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
         elif (repository / path).read_bytes() != content:
             differences.append(f"{repository / path}: differs from what `rfm export` generates")
     return differences
-
-
-def _check_weights(folder: Path, weights: str | None, settings: ExportConfig) -> None:
-    """Raise ExportError if the settings name other weights than the export has: a new export would rewrite them."""
-    if settings.weights not in (None, weights):
-        remedy = "leave out --weights, or export again"
-        raise ExportError.at(folder, f"weights in {settings.weights}", weights or "full ones", remedy)
 
 
 def _read_config(repository: Path, name: str) -> Any:

@@ -10,7 +10,6 @@ whole batch, and leaves nothing to the other GPUs.
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -24,12 +23,11 @@ from google.protobuf.text_format import ParseError
 
 from rfm import published
 from rfm.config import ExportConfig
-from rfm.engine.computation import computation
+from rfm.engine.device import computation
 from rfm.engine.family import NETWORK, Checkpoint, Family, FrameEncoders, config_fields
-from rfm.files import read_run_config
 from rfm.parameters import CHECKPOINT_FOLDER
-from rfm.published.hub import check_links, commit_of
-from rfm.published.provenance import Assumption, is_folder, license_of, source_name
+from rfm.published.hub import check_links
+from rfm.published.provenance import Assumption
 from rfm.published.run_config import find_run_config
 from rfm.serve.repository import CONFIG_FILE
 from rfm.weights import num_values
@@ -47,8 +45,6 @@ MOST_SAMPLES = 64  # small networks hardly gain from more
 TYPICAL_FRAMES, TYPICAL_PX = 8, 224
 TYPICAL_TASK = "put the red block in the bowl"
 _TERA = 1e12
-
-_SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # for example hub_token, wandb_api_key
 
 
 @dataclass(frozen=True)
@@ -83,35 +79,37 @@ def read_for_export(
     *,
     other_machine: bool,
 ) -> Source:
-    """Read and check all that an export needs, before it writes. Parameters and errors: see ``export``."""
+    """Read and check all that an export needs, before it writes. Parameters and errors: see ``export``.
+
+    Tell the user which file has the training run's settings, and about possible faults.
+    """
     if not other_machine:
         _check_gpus(settings.num_gpus)
     named = None if device is None else device_named(device)
-    read = read_source(source, settings, family, say)
-    _check_graphs(settings, read.checkpoint.description)
-    return replace(read, settings=with_batch_size(settings, read.checkpoint, say), device=named)
-
-
-def read_source(source: str | Path, settings: ExportConfig, family: str | None, say: Printer) -> Source:
-    """Read a checkpoint. Tell the user which file has the training run's settings, and about possible faults."""
     folder = published.find(source, say)
     kind = published.choose(folder, family, settings)
     loaded = published.read_from(folder, kind, settings)
-    checkpoint = loaded.checkpoint
+    checkpoint, encoders = loaded.checkpoint, loaded.encoders()
     check_links(folder)
-    encoders = loaded.encoders()
     if (run_config := find_run_config(folder)) is not None:
         say(f"{run_config}: read as the settings of the training run")
     for note in published.notes(folder, loaded):
         say(note)
     gpus = num_gpus(settings)
-    computed = computation(checkpoint, settings.torch_dtype, on_gpu=gpus > 0)
-    origin = origin_of(source, folder, computed)
-    of_encoders = None if encoders is None else described_encoders(encoders.description, origin)
-    full = None if settings.weights is None else partial(_full, folder, kind, settings)
-    description = described(checkpoint, origin)
+    origin = published.origin_of(source, folder, computation(checkpoint, settings.torch_dtype, on_gpu=gpus > 0))
+    origin = replace(origin, weights_difference=_earlier_difference(folder))
+    _check_graphs(settings, checkpoint.description)
     return Source(
-        kind, checkpoint, tuple(loaded.assumptions), encoders, description, of_encoders, settings, gpus, None, full
+        kind,
+        checkpoint,
+        tuple(loaded.assumptions),
+        encoders,
+        described(checkpoint, origin),
+        None if encoders is None else described_encoders(encoders.description, origin),
+        with_batch_size(settings, checkpoint, say),
+        gpus,
+        named,
+        None if settings.weights is None else partial(_full, folder, kind, settings),
     )
 
 
@@ -188,26 +186,6 @@ def typical_sample(checkpoint: Checkpoint) -> ProgressSample:
     return ProgressSample(random_trajectory(random, num_frames, description.widths, task=TYPICAL_TASK, size_px=size_px))
 
 
-def origin_of(source: str | Path, folder: Path, computation: str) -> Origin:
-    """Return the checkpoint's origin: source, commit, training run's config.yaml, licence, effect of rounded weights.
-
-    For a folder, the source is the end of its path. config.yaml becomes JSON without secrets.
-
-    source: as the user named it
-    folder: the checkpoint's files; from the Hub, a snapshot named by its commit
-    computation: as in ``Origin``
-    """
-    file = find_run_config(folder)
-    return Origin(
-        source=source_name(source),
-        revision=None if is_folder(source) else commit_of(folder),
-        license=license_of(folder),
-        run_config={} if file is None else _public(read_run_config(file)),
-        computation=computation,
-        weights_difference=_earlier_difference(folder),
-    )
-
-
 def _earlier_difference(folder: Path) -> float | None:
     """Return the difference that an export measured when it wrote this folder; None: not measured, or no export."""
     kept = folder.parent / CONFIG_FILE  # in the version folder
@@ -232,21 +210,6 @@ def described(checkpoint: Checkpoint, origin: Origin) -> Description:
 def described_encoders(encoders: Description, origin: Origin) -> Description:
     """Return the description for encoders that are exported with a scorer from this origin."""
     return replace(encoders, source=origin.source, revision=origin.revision)
-
-
-def _public(value: Any) -> Any:
-    """Return a YAML value in JSON types, without texts whose keys name a secret."""
-    if isinstance(value, dict):
-        kept = {str(key): inner for key, inner in value.items() if not _is_secret(str(key), inner)}
-        return {key: _public(inner) for key, inner in kept.items()}
-    if isinstance(value, (list, tuple, set)):
-        return [_public(inner) for inner in value]
-    is_plain = value is None or isinstance(value, (str, int)) or (isinstance(value, float) and math.isfinite(value))
-    return value if is_plain else str(value)
-
-
-def _is_secret(key: str, value: Any) -> bool:
-    return isinstance(value, (str, bytes)) and _SECRET.search(key) is not None
 
 
 def _network(checkpoint: Checkpoint) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""CUDA calls for memory, streams and the current device, and out-of-memory errors.
+"""Devices: memory, streams, the current device, out-of-memory errors, and what decides a score's last digits.
 
+PyTorch chooses the kernel for ``scaled_dot_product_attention`` by its version, the GPU, the dtype and the shapes.
 ``tests/support/pretended.py`` replaces CUDA functions, so tests run the same code without a GPU.
 """
 
@@ -9,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,11 +33,6 @@ def memory_errors() -> Iterator[None]:
         raise torch.OutOfMemoryError(str(error)) from error
 
 
-def free_unused() -> None:
-    """Free the GPU memory that PyTorch caches; do nothing without a GPU."""
-    torch.cuda.empty_cache()
-
-
 def use(device: torch.device) -> None:
     """Make ``device`` the current device for this thread.
 
@@ -43,11 +40,6 @@ def use(device: torch.device) -> None:
     """
     if device.type == "cuda":
         torch.cuda.set_device(device)
-
-
-def pinned(tensor: Tensor) -> Tensor:
-    """Return the tensor in pinned memory, from which a GPU copies asynchronously."""
-    return tensor.pin_memory()
 
 
 class Copies:
@@ -62,7 +54,7 @@ class Copies:
         if self._stream is None:
             return pixels
         with torch.cuda.stream(self._stream):  # PyTorch keeps the pinned copy until this stream has read it
-            return pinned(pixels).to(self._stream.device, non_blocking=True)
+            return pixels.pin_memory().to(self._stream.device, non_blocking=True)
 
     def wait_for(self, pixels: Iterable[Tensor]) -> None:
         """Make the current stream, not the host, wait for all copies started so far.
@@ -75,3 +67,17 @@ class Copies:
         current.wait_stream(self._stream)
         for each in pixels:
             each.record_stream(current)
+
+
+TORCH = f"torch {torch.__version__}"
+ATTENTION = "scaled_dot_product_attention"
+
+
+def computation(checkpoint: Any, dtype: torch.dtype | None, *, on_gpu: bool) -> str:
+    """Return number type, PyTorch version and attention as one line.
+
+    dtype: network dtype; None: float32 on the CPU, otherwise the checkpoint's own
+    """
+    if dtype is None:
+        dtype = getattr(checkpoint.config, "torch_dtype", torch.float32) if on_gpu else torch.float32
+    return f"{str(dtype).removeprefix('torch.')}, {TORCH}, {ATTENTION}"

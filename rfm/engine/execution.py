@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from rfm.engine.device import free_unused, memory_errors
+from rfm.engine.device import memory_errors
 from rfm_client.contract import InferenceFailedError
 
 Output = TypeVar("Output")
@@ -68,7 +68,7 @@ class Execution:
             _log.warning("out of memory with %d rows: %s", len(rows), error)
         finally:
             self.on_forward()
-        free_unused()
+        torch.cuda.empty_cache()  # does nothing without a GPU
         if len(rows) == 1:
             output = None if divided is None else divided(rows[0])
             return [output or InferenceFailedError("the sample does not fit in the device's memory")]

@@ -6,7 +6,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -20,12 +20,7 @@ _ENTRY_BYTES = 256  # key, array header and ordered dict entry
 
 
 Source = TypeVar("Source")
-Kept = TypeVar("Kept", bound="_Array")
-
-
-class _Array(Protocol):  # a NumPy array, or a tensor on any device
-    @property
-    def nbytes(self) -> int: ...
+Kept = TypeVar("Kept", bound=Any)  # a NumPy array, or a tensor on any device
 
 
 class FeatureCache(Generic[Kept]):

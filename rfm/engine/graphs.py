@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -55,16 +55,6 @@ class Captured:
         return self.output.clone()  # graphs share memory, so the next replay of any graph may overwrite the output
 
 
-class Capture(Protocol):
-    """Captures a call: ``CudaCapture``, or a substitute in tests."""
-
-    def __call__(self, function: Function, tensors: Sequence[Tensor], beside: Captured | None) -> Captured:
-        """Return the captured call ``function(*tensors)``. Raises RuntimeError if it cannot be captured.
-
-        beside: a captured call whose memory it shares; None: it is the only one
-        """
-
-
 class CudaCapture:
     """Captures calls on a CUDA device, all on one stream, as PyTorch requires if graphs share memory."""
 
@@ -73,7 +63,10 @@ class CudaCapture:
         self._stream: Any = None  # made at the first capture
 
     def __call__(self, function: Function, tensors: Sequence[Tensor], beside: Captured | None) -> Captured:
-        """Return the captured call ``function(*tensors)``; see ``Capture``."""
+        """Return the captured call ``function(*tensors)``. Raises RuntimeError if it cannot be captured.
+
+        beside: a captured call whose memory it shares; None: it is the only one
+        """
         self._stream = self._stream or torch.cuda.Stream(self._device)  # type: ignore[no-untyped-call]  # as PyTorch declares it
         pool = torch.cuda.graph_pool_handle() if beside is None else beside.pool
         inputs = [tensor.clone() for tensor in tensors]
@@ -95,13 +88,13 @@ class CudaCapture:
 class Graphs:
     """Calls tensor functions; from the third call with the same shapes, as a CUDA graph. For one thread.
 
-    capture: captures a call
+    capture: captures a call, as ``CudaCapture`` does
     max_graphs: how many graphs are kept
 
     After a capture has failed, all calls are plain.
     """
 
-    def __init__(self, capture: Capture, max_graphs: int = MAX_GRAPHS) -> None:
+    def __init__(self, capture: Callable[..., Captured], max_graphs: int = MAX_GRAPHS) -> None:
         self.num_captured = self.num_replayed = 0
         self.has_failed = False
         self._capture, self._max_graphs = capture, max_graphs

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from torch import Tensor
 
 from rfm.engine.execution import Execution
-from rfm.engine.graphs import Graphs
 from rfm.engine.layers import progress_from_logits
 from rfm_client.contract import (
     FrameScores,
@@ -29,26 +28,22 @@ Batch = TypeVar("Batch")
 
 
 class Predictor(Protocol[Row, Batch]):
-    """A network on a device, with batch collation.
+    """A network on a device, with batch collation. A subclass gets what most families have in common.
 
     A row is one token sequence, or several that begin alike.
+
+    has_progress: False if the network does not predict progress, which is then NaN
+    reads_views: True if the network reads a goal and views from further cameras
+    works_ahead: True if ``work_ahead`` takes enough time to be worth a thread
     """
 
-    @property
-    def has_progress(self) -> bool:
-        """False if the network does not predict progress, which is then NaN."""
+    has_progress: bool = True
+    reads_views: bool = False
+    works_ahead: bool = False
 
     @property
     def has_success(self) -> bool:
         """False if the network does not predict success, which is then NaN."""
-
-    @property
-    def reads_views(self) -> bool:
-        """True if the network reads a goal and views from further cameras."""
-
-    @property
-    def works_ahead(self) -> bool:
-        """True if ``work_ahead`` takes enough time to be worth a thread."""
 
     def rows(self, sample: Sample) -> list[Row]:
         """Return the sample's rows, without a forward pass: one, or one per prefix to score.
@@ -61,9 +56,11 @@ class Predictor(Protocol[Row, Batch]):
 
     def sequences(self, row: Row) -> Sequence[Row]:
         """Return the row's token sequences, each as a row. Most rows have one."""
+        return (row,)
 
     def work_ahead(self, rows: Sequence[Row]) -> None:
-        """Do the slow, independent work on these rows; thread-safe. ``collate`` does the rest."""
+        """Do the slow, independent work on these rows, if any; thread-safe. ``collate`` does the rest."""
+        return
 
     def collate(self, rows: Sequence[Row]) -> Batch:
         """Return one batch; may run while the device computes."""
@@ -78,14 +75,8 @@ class Predictor(Protocol[Row, Batch]):
         """
 
     def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
-        """Return frame scores for a progress sample, from all row scores."""
-
-
-class GraphedPredictor(Predictor[Row, Batch], Protocol):
-    """A predictor that can score small batches with CUDA graphs: ``Description.uses_graphs``."""
-
-    def use_graphs(self, graphs: Graphs) -> None:
-        """Score small batches with these graphs from now on."""
+        """Return frame scores for a progress sample: the only row's; in dense mode, each prefix's last frame."""
+        return of_prefixes(rows) if getattr(sample, "frame_steps", 0) else rows[0].frames[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +99,8 @@ def check_type(sample: Sample, config: Any) -> None:
     config: the network's configuration
     """
     heads = {"preference": config.has_preference, "similarity": config.has_similarity}
-    asked = {PreferenceSample: "preference", SimilaritySample: "similarity"}.get(type(sample))
+    kinds: dict[type, str] = {PreferenceSample: "preference", SimilaritySample: "similarity"}
+    asked = kinds.get(type(sample))
     if asked is not None and not heads[asked]:
         supported = " or ".join(["progress", *(name for name, is_there in heads.items() if is_there)])
         raise InvalidSampleError.at("sample_type", f"{supported} (this checkpoint has no {asked} head)", asked)
@@ -128,11 +120,6 @@ def frame_scores(progress_logits: Tensor, success_logits: Tensor | None) -> Fram
         success=no_success(progress) if success_logits is None else success_logits.sigmoid().float().cpu().numpy(),
         progress_logits=progress_logits.float().cpu().numpy() if discrete else None,
     )
-
-
-def of_rows(sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
-    """Return scores for a progress sample: the only row's; in dense mode, each prefix's last frame."""
-    return of_prefixes(rows) if getattr(sample, "frame_steps", 0) else rows[0].frames[0]
 
 
 def of_prefixes(rows: Sequence[RowScores]) -> FrameScores:

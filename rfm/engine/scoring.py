@@ -7,7 +7,7 @@ import time
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, TypeAlias, cast
 
 import numpy as np
@@ -21,10 +21,9 @@ from rfm.engine.family import Checkpoint, FrameEncoders
 from rfm.engine.feature_cache import BYTES_PER_MIB, FeatureCache
 from rfm.engine.graphs import CudaCapture, Graphs
 from rfm.engine.layers import keep_float32
-from rfm.engine.predictor import GraphedPredictor, Predictor, RowScores, of_prefixes
+from rfm.engine.predictor import Predictor, RowScores, of_prefixes
 from rfm_client.contract import (
     FRAME_SCORES,
-    BatchTiming,
     InferenceFailedError,
     InvalidSampleError,
     PreferenceResult,
@@ -36,7 +35,7 @@ from rfm_client.contract import (
     Sample,
     SimilarityResult,
 )
-from rfm_client.contract.results import answer, trajectory_scores
+from rfm_client.contract.results import BatchTiming, answer, trajectory_scores
 from rfm_client.contract.samples import EncoderSample, with_trajectories
 
 Outcome: TypeAlias = Result | RewardError
@@ -55,6 +54,7 @@ class Prepared:
     num_tokens: int = 0
 
 
+@dataclass(eq=False, repr=False)
 class Engine:
     """Scores samples with one network on one device.
 
@@ -63,27 +63,20 @@ class Engine:
     token_budget: maximum tokens, with padding, in a forward pass over several rows; a larger row runs alone
     max_sample_tokens: maximum tokens in one sequence; longer samples are refused
     cache: the predictor's cache for frame features; None: no cache
-    graphs: CUDA graphs for small batches, if the predictor can use them; None: all passes are plain
+    graphs: CUDA graphs for small batches, if the predictor has ``use_graphs``; None: all passes are plain
     """
 
-    def __init__(
-        self,
-        predictor: Predictor[Any, Any],
-        *,
-        encoders: FrameEncoders | None = None,
-        token_budget: int = DEFAULT_TOKEN_BUDGET,
-        max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
-        cache: FeatureCache[Any] | None = None,
-        graphs: Graphs | None = None,
-    ) -> None:
-        self.predictor = predictor
-        self.encoders = encoders
-        self.token_budget = token_budget
-        self.max_sample_tokens = max_sample_tokens
-        self.cache = cache
-        self.graphs = graphs
-        if graphs is not None:
-            cast("GraphedPredictor[Any, Any]", predictor).use_graphs(graphs)
+    predictor: Predictor[Any, Any]
+    _: KW_ONLY
+    encoders: FrameEncoders | None = None
+    token_budget: int = DEFAULT_TOKEN_BUDGET
+    max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS
+    cache: FeatureCache[Any] | None = None
+    graphs: Graphs | None = None
+
+    def __post_init__(self) -> None:
+        if self.graphs is not None:
+            cast(Any, self.predictor).use_graphs(self.graphs)
 
     @classmethod
     def of(
@@ -255,7 +248,13 @@ class Engine:
 
         def divided(row: Any) -> RowScores | RewardError | None:
             sequences = self.predictor.sequences(row)
-            return _of_sequences(execution.run(forward, sequences)) if len(sequences) > 1 else None
+            if len(sequences) == 1:
+                return None
+            outcomes = execution.run(forward, sequences)  # of prefixes
+            if errors := [each for each in outcomes if isinstance(each, RewardError)]:
+                return errors[0]
+            scores = of_prefixes([each for each in outcomes if isinstance(each, RowScores)])
+            return RowScores([scores], is_of_prefixes=True)
 
         return execution.run(forward, rows, divided)
 
@@ -289,14 +288,6 @@ class Engine:
         if isinstance(sample, PreferenceSample):
             return PreferenceResult(preference=query, first=first, second=second, timing=timing)
         return SimilarityResult(similarity=query, reference=first, other=second, timing=timing)
-
-
-def _of_sequences(outcomes: Sequence[RowScores | RewardError]) -> RowScores | RewardError:
-    """Join the scores of sequences, which are prefixes, into row scores, or return the first error."""
-    error = next((outcome for outcome in outcomes if isinstance(outcome, RewardError)), None)
-    if error is not None:
-        return error
-    return RowScores([of_prefixes([each for each in outcomes if isinstance(each, RowScores)])], is_of_prefixes=True)
 
 
 def _finite(outcomes: Sequence[Result | RewardError], *, lacks: Collection[str]) -> list[Result | RewardError]:

@@ -9,7 +9,10 @@ safetensors, and YAML tags construct no objects.
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Collection
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -17,13 +20,18 @@ from typing import Any
 from rfm.config import CheckpointConfig
 from rfm.engine.family import NETWORK, Checkpoint, Family
 from rfm.families import FAMILIES, named
-from rfm.files import WEIGHTS, CheckpointError
+from rfm.files import WEIGHTS, CheckpointError, read_run_config
+from rfm.published.hub import commit_of
 from rfm.published.hub import find as find
-from rfm.published.provenance import assumption_lines
+from rfm.published.provenance import assumption_lines, is_folder, license_of, source_name
 from rfm.published.reader import Loaded, Reader, asked, check_used
-from rfm.published.run_config import HEADS, SIMILARITY, constant_heads, training_notes
+from rfm.published.rounding import rounded_as_asked
+from rfm.published.run_config import HEADS, SIMILARITY, constant_heads, find_run_config, training_notes
 from rfm.weights import check_values
 from rfm_client.contract.checks import require
+from rfm_client.contract.description import Origin
+
+_SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # for example hub_token, wandb_api_key
 
 
 def reader_of(family: Family) -> Reader:
@@ -72,6 +80,7 @@ def load(source: str | Path, **options: Any) -> Checkpoint:
 def read_from(folder: Path, family: Family, options: CheckpointConfig) -> Loaded:
     """Read a checkpoint from a local folder. Raises CheckpointError, also for non-finite weights or zero matrices."""
     loaded = reader_of(family).load(folder, options)
+    loaded = replace(loaded, checkpoint=rounded_as_asked(loaded.checkpoint, options.weights))
     check_used(options, loaded.checkpoint.config)
     for weights in loaded.checkpoint.parts.values():
         check_values(weights)
@@ -91,4 +100,38 @@ def notes(folder: Path, loaded: Loaded, answered: Collection[str] = HEADS) -> li
     without = [f"{WEIGHTS}: there is no head of {' and '.join(missing)}: served without"] if missing else []
     of_weights = constant_heads(loaded.checkpoint.parts[NETWORK], heads)
     of_run = training_notes(folder, heads)
-    return [*without, *of_run, *of_weights, *loaded.notes(), *assumption_lines(loaded.assumptions)]
+    return [*without, *of_run, *of_weights, *loaded.notes(loaded.checkpoint), *assumption_lines(loaded.assumptions)]
+
+
+def origin_of(source: str | Path, folder: Path, computation: str) -> Origin:
+    """Return the checkpoint's origin: source, commit, training run's config.yaml, licence.
+
+    For a folder, the source is the end of its path. config.yaml becomes JSON without secrets.
+
+    source: as the user named it
+    folder: the checkpoint's files; from the Hub, a snapshot named by its commit
+    computation: as in ``Origin``
+    """
+    file = find_run_config(folder)
+    return Origin(
+        source=source_name(source),
+        revision=None if is_folder(source) else commit_of(folder),
+        license=license_of(folder),
+        run_config={} if file is None else _public(read_run_config(file)),
+        computation=computation,
+    )
+
+
+def _public(value: Any) -> Any:
+    """Return a YAML value in JSON types, without texts whose keys name a secret."""
+    if isinstance(value, dict):
+        kept = {str(key): inner for key, inner in value.items() if not _is_secret(str(key), inner)}
+        return {key: _public(inner) for key, inner in kept.items()}
+    if isinstance(value, (list, tuple, set)):
+        return [_public(inner) for inner in value]
+    is_plain = value is None or isinstance(value, (str, int)) or (isinstance(value, float) and math.isfinite(value))
+    return value if is_plain else str(value)
+
+
+def _is_secret(key: str, value: Any) -> bool:
+    return isinstance(value, (str, bytes)) and _SECRET.search(key) is not None

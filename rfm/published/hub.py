@@ -3,16 +3,14 @@
 
 from __future__ import annotations
 
-import difflib
 import logging
 import re
-import shlex
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from rfm.files import HUB_FILES, HUB_WEIGHTS, RUN_CONFIG, WEIGHTS, CheckpointError, cut, is_there, shown
 from rfm.published.provenance import snapshot_of
-from rfm.published.weights import PICKLE_STEM, pickled_weights
+from rfm.published.weights import refuse_pickles
 from rfm_client.contract.hub_access import HubError, hub_errors, unreachable
 
 _log = logging.getLogger(__name__)
@@ -33,15 +31,13 @@ def find(source: str | Path, say: Callable[[str], object] = _log.warning) -> Pat
         if str(source) and path.is_dir():
             return path
         if path.is_file():
-            is_weights = path.suffix == ".safetensors"
-            remedy = f"name its folder, {path.absolute().parent}" if is_weights else ""
-            raise CheckpointError.at("checkpoint", _SOURCE, f"the file {path}", remedy)
+            raise CheckpointError.at("checkpoint", _SOURCE, f"the file {path}", f"name its folder, {path.parent}")
     except (OSError, RuntimeError) as error:
         got = f"{shown(str(source))}: {type(error).__name__}"
         raise CheckpointError.at("checkpoint", _SOURCE, got) from error
     match = _ID.fullmatch(str(source))
     if match is None or ".." in Path(source).parts:
-        raise CheckpointError.at("checkpoint", _SOURCE, f"{shown(str(source))}{_near(path)}")
+        raise CheckpointError.at("checkpoint", _SOURCE, shown(str(source)))
     return _fetch(match["repo"], match["subfolder"] or "", match["tag"], path, say)
 
 
@@ -76,12 +72,12 @@ def _fetch(repo_id: str, subfolder: str, tag: str | None, path: Path, say: Calla
         down = unreachable(repo_id, revision=tag)
         with hub_errors():
             tag = tag or (_best_revision(repo_id) if down is None else _cached_revision(repo_id, down, say))
-            return _snapshot(repo_id, subfolder, tag, path, is_down=down is not None)
+            return _snapshot(repo_id, subfolder, tag, is_down=down is not None)
     except HubError as error:
         where = repo_id if tag is None else f"{repo_id}@{tag}"
         why = str(error) if down in (None, str(error)) else f"{down}, and {error}"
         raise CheckpointError(
-            f"{where}: cannot be fetched: {cut(why)}; there is no folder {path.absolute()} either{_near(path)}; "
+            f"{where}: cannot be fetched: {cut(why)}; there is no folder {path.absolute()} either; "
             f"name one, or see to the Hub's name, login and network{_cached(repo_id, subfolder)}"
         ) from error
 
@@ -103,9 +99,9 @@ def _cached_revision(repo_id: str, down: str, say: Callable[[str], object]) -> s
     return revision
 
 
-def _snapshot(repo_id: str, subfolder: str, tag: str | None, path: Path, *, is_down: bool) -> Path:
+def _snapshot(repo_id: str, subfolder: str, tag: str | None, *, is_down: bool) -> Path:
     """Return a revision's folder in the Hub's cache, with all files that are read. tag: None: main."""
-    from huggingface_hub import snapshot_download
+    from huggingface_hub import HfApi, snapshot_download
 
     patterns, run_configs = HUB_FILES, [RUN_CONFIG]
     if subfolder:
@@ -115,40 +111,14 @@ def _snapshot(repo_id: str, subfolder: str, tag: str | None, path: Path, *, is_d
     snapshot = Path(snapshot_download(repo_id, revision=tag, allow_patterns=patterns, local_files_only=is_down))
     folder = snapshot / subfolder
     if not is_down and not any(folder.rglob(HUB_WEIGHTS)):
-        _refuse_pickles(repo_id, subfolder, tag)
+        files = [Path(file.rfilename) for file in HfApi().model_info(repo_id, revision=tag).siblings or ()]
+        names = (file.name for file in files if file.parent == Path(subfolder))
+        refuse_pickles(f"{repo_id}@{tag or 'main'}", WEIGHTS, names)
     if not any(is_there(snapshot / name) for name in run_configs):  # upstream tags the commit before its upload
         _fetch_run_config_of_main(repo_id, run_configs, is_down=is_down)
     if not folder.is_dir():
-        raise CheckpointError.at(
-            f"{repo_id}@{tag or 'main'}", f"the folder {subfolder}", f"none of this name{_near(path)}"
-        )
+        raise CheckpointError.at(f"{repo_id}@{tag or 'main'}", f"the folder {subfolder}", "none of this name")
     return folder
-
-
-def _refuse_pickles(repo_id: str, subfolder: str, tag: str | None) -> None:
-    from huggingface_hub import HfApi
-
-    files = [Path(file.rfilename) for file in HfApi().model_info(repo_id, revision=tag).siblings or ()]
-    names = pickled_weights((file.name for file in files if file.parent == Path(subfolder)), PICKLE_STEM)
-    if names:
-        revision = "" if tag is None else f" --revision {shlex.quote(tag)}"
-        fetch = f"hf download {repo_id}{revision} --local-dir FOLDER"
-        got = (
-            f"{cut(', '.join(names))}: pickles may run code when they are loaded, so none is fetched. If you trust who "
-            f"made it: {fetch}, then name {Path('FOLDER', subfolder)} as the checkpoint, and the refusal says "
-            "how to convert it"
-        )
-        raise CheckpointError.at(f"{repo_id}@{tag or 'main'}", WEIGHTS, got)
-
-
-def _near(path: Path) -> str:
-    """Name the folders beside a missing path that have similar names."""
-    try:
-        names = [beside.name for beside in path.parent.iterdir() if beside.is_dir()]
-    except OSError:
-        return ""
-    alike = difflib.get_close_matches(path.name, names)
-    return f" (but {', '.join(str(path.parent / name) for name in alike)})" if alike else ""
 
 
 def _snapshots(repo_id: str) -> dict[str, Path]:
@@ -163,8 +133,7 @@ def _snapshots(repo_id: str) -> dict[str, Path]:
 
 def _cached(repo_id: str, subfolder: str) -> str:
     """Name a repository's revisions in the Hub's cache, which need no network."""
-    within = f"/{subfolder}" if subfolder else ""
-    names = [f"{repo_id}{within}@{name}" for name in _snapshots(repo_id)]
+    names = [f"{repo_id}{'/' * bool(subfolder)}{subfolder}@{name}" for name in _snapshots(repo_id)]
     return f"; without it, name a revision that is in the cache: {', '.join(names)}" if names else ""
 
 

@@ -8,17 +8,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-import torch
 from torch import Tensor
 
-from rfm.config import CheckpointConfig, VideoPrompt, Weights
+from rfm.config import CheckpointConfig
 from rfm.files import NETWORK_CONFIG, CheckpointError, is_there, network_config, read_json, shown
 from rfm.published.provenance import HUB_FOLDER, Assumption, source_name
 from rfm.published.qwen import QWEN_NAMES, Renames, backbone_config, decided, renamed
 from rfm.published.robometer_run import DTYPES
-from rfm.published.rounding import kind_of, read_published, read_unrounded_config, round_layers, rounded_as_asked
+from rfm.published.rounding import kind_of, read_published, read_unrounded_config
 from rfm.published.run_config import find_run_config
-from rfm.qwen.language import EMBEDDING, HEAD, LanguageCheckpoint, LanguageConfig
+from rfm.qwen.language import EMBEDDING, HEAD, LanguageCheckpoint
 from rfm.qwen.network import QWEN3, QWEN_2_5, Dtype
 from rfm.saved import PROCESSOR_FOLDER, reward_model_of
 
@@ -31,25 +30,17 @@ Made = TypeVar("Made", bound=LanguageCheckpoint)
 
 @dataclass(frozen=True)
 class LanguageFolder:
-    """The files in a Qwen-VL's folder.
+    """What the files in a Qwen-VL's folder say.
 
-    backbone: as in ``BackboneConfig``
-    dtype: stated by config.json
-    base_model: source of the tokenizer and processor
-    video_prompt: form of the prompt
-    rounded: number format for rounded layers; None: not rounded
+    made_of: the fields of LanguageConfig
+    processor: source of the tokenizer and processor
     assumed: dtype, video_prompt and language_head, if no file proves them
     """
 
-    folder: Path
-    backbone: dict[str, Any]
+    made_of: dict[str, Any]
     weights: dict[str, Tensor]
     processor: str | Path
-    dtype: str
-    base_model: str
-    video_prompt: VideoPrompt
-    rounded: Weights | None = None
-    assumed: tuple[Assumption, ...] = ()
+    assumed: tuple[Assumption, ...]
 
     @classmethod
     def read(cls, folder: Path, options: CheckpointConfig, backbones: Mapping[str, str] = ONLY_QWEN3) -> LanguageFolder:
@@ -63,8 +54,7 @@ class LanguageFolder:
             expected = " or ".join(f"{kind}, of an ordinary {name}" for kind, name in backbones.items())
             raise CheckpointError.at(f"{file}: model_type", expected, shown(content.get("model_type")))
         backbone = backbone_config(content, file)
-        is_nf4 = read_unrounded_config(backbone, file)
-        tensors, _ = read_published(folder, is_nf4)
+        tensors, _ = read_published(folder, read_unrounded_config(backbone, file))
         weights = {name: tensor for name, tensor in renamed(tensors, _NAMES).items() if "inv_freq" not in name}
         if any(name.startswith("progress_head") for name in weights):
             raise CheckpointError.at(folder, "an ordinary Qwen3-VL", "reward heads: leave out --as")
@@ -73,35 +63,24 @@ class LanguageFolder:
         processor = options.base_model or (own if is_there(own / "tokenizer.json") else folder)
         dtype, of_dtype = dtype_of(backbone, file)
         form, of_form = decided(options.video_prompt, backbone, NETWORK_CONFIG, may_be_saved_later=True)
-        rounded = kind_of(weights)
-        if rounded is None and options.weights is not None:
-            weights, _ = round_layers(weights, {}, options.weights, getattr(torch, dtype))
-            rounded = options.weights
-        name = source_name(processor)
-        assumed = (*of_dtype, *of_form, *of_head)
-        return cls(folder, backbone, weights, processor, dtype, name, form, rounded, assumed)
-
-    @property
-    def made_of(self) -> dict[str, Any]:
-        """The fields of LanguageConfig."""
-        return {
-            "backbone": self.backbone,
-            "dtype": self.dtype,
-            "base_model_id": self.base_model,
-            "video_prompt": self.video_prompt,
-            "weights": self.rounded,
+        made_of = {
+            "backbone": backbone,
+            "dtype": dtype,
+            "base_model_id": source_name(processor),
+            "video_prompt": form,
+            "weights": kind_of(weights),
         }
+        return cls(made_of, weights, processor, (*of_dtype, *of_form, *of_head))
 
-    def assumptions(self, config: LanguageConfig) -> tuple[Assumption, ...]:
-        """Return the unproven settings that have an effect."""
-        return tuple(each for each in self.assumed if not (config.multi_image and each.name == "video_prompt"))
+    def assumed_but(self, unused: str) -> tuple[Assumption, ...]:
+        """Return the unproven settings without one that has no effect."""
+        return tuple(each for each in self.assumed if each.name != unused)
 
 
 def reopened(made: type[Made], folder: Path, options: CheckpointConfig) -> Made:
-    """Load an export, with the processor and weight format that the user asks for. Raises CheckpointError."""
+    """Load an export, with the processor that the user asks for. Raises CheckpointError."""
     checkpoint = made.restore(folder)
-    config, weights, _ = rounded_as_asked(checkpoint.config, checkpoint.weights, {}, options.weights)
-    return replace(checkpoint, config=config, weights=weights, processor=options.base_model or checkpoint.processor)
+    return replace(checkpoint, processor=options.base_model or checkpoint.processor)
 
 
 def _tie(weights: dict[str, Tensor], config: Mapping[str, Any], file: Path) -> tuple[Assumption, ...]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""PEFT adapters, and which targeted modules lack factors, by PEFT's rules (``check_target_module_exists``, PEFT 0.21).
+"""LoRA adapters: PEFT says which modules have factors, of which rank and scaling.
 
 A module is the name of its weight without ``.weight``, under VlmRewardModel's names.
 """
@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+import time
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from rfm.files import (
     WEIGHTS_INDEX,
     CheckpointError,
     cut,
+    expecting,
     is_there,
     listed,
     local_copy,
@@ -31,9 +32,9 @@ from rfm.files import (
     read_tensors,
     shown,
 )
-from rfm.published.nf4 import dequantize
 from rfm.published.qwen import (
     ADAPTER_NAMES,
+    LORA_INSIDE,
     NF4,
     QWEN_NAMES,
     UNQUANTIZED,
@@ -42,72 +43,132 @@ from rfm.published.qwen import (
     quantization,
     renamed,
 )
+from rfm.published.rounding import dequantize
 from rfm.published.weights import read_weights, refuse_pickles
 from rfm.qwen.lora import BASE_LAYER, LORA_NAME, MERGE, module_of
+from rfm.qwen.network import BackboneConfig, build_backbone
+from rfm_client.contract.checks import require
 
 WHOLE, TEXT = "model.", "model.language_model."  # what PEFT wraps
-_ALL_LINEAR = "all-linear"
-_LAYER = re.compile(r"\.\d+\.")  # the first one in a name
-_PATTERN_S = 5  # for a pattern from an unknown author
 # Factor initialisations that do not change the base model's weights.
 _PLAIN_INITS = (True, False, "gaussian", "orthogonal")
-# Fields in adapter_config.json that change no score. Any other field, if set, may change the formula above.
-_HARMLESS = {
-    "auto_mapping", "base_model_name_or_path", "bias", "ensure_weight_tying", "exclude_modules", "inference_mode",
-    "init_lora_weights", "layers_pattern", "layers_to_transform", "lora_alpha", "lora_dropout", "megatron_core",
-    "modules_to_save", "peft_type", "peft_version", "qalora_group_size", "r", "revision", "runtime_config",
-    "target_modules", "task_type",
+_PATTERN_S = 5  # for all patterns from an unknown author
+# Fields of a LoRA configuration that PEFT applies, in all versions. A weight is W + scaling * B A.
+_APPLIED = (
+    "alpha_pattern", "exclude_modules", "layers_pattern", "layers_to_transform", "lora_alpha", "modules_to_save", "r",
+    "rank_pattern", "target_modules", "use_rslora",
+)  # fmt: skip
+# Fields that change no score. Any other field, if set, may change the formula above.
+_HARMLESS = (
+    "auto_mapping", "base_model_name_or_path", "bias", "ensure_weight_tying", "inference_mode", "init_lora_weights",
+    "lora_dropout", "megatron_core", "peft_type", "peft_version", "qalora_group_size", "revision", "runtime_config",
+    "task_type",
     "peft_vision_encoder",  # upstream's, in config.yaml
-}  # fmt: skip
+)  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Scaling:
-    """Rank and alpha for LoRA factors, and the file that states them."""
+def scaled(
+    tensors: Mapping[str, Tensor], file: Path, config: Mapping[str, Any], backbone: dict[str, Any], root: str = WHOLE
+) -> dict[str, Tensor]:
+    """Return the tensors, with PEFT's scaling of each module in its LoRA factor B.
 
-    file: Path
-    rank: int
-    alpha: float
+    file: states ``config``, the adapter's configuration
+    root: prefix for the modules that PEFT wrapped
+    Raises CheckpointError unless the factors are those of the modules that the configuration names.
+    """
+    factors = {name: tensor for name, tensor in tensors.items() if LORA_NAME.fullmatch(name)}
+    present = set(map(module_of, factors))
+    layers = _layers(file, config, backbone, root)
+    check_none_lost(file, layers.keys() - present)
+    if more := sorted(present - layers.keys()):
+        raise CheckpointError.at(file, "the modules with LoRA factors", f"a configuration without {listed(more)}")
+    found = {**tensors}
+    for name, factor in factors.items():
+        layer = layers[module_of(name)]
+        rank, scale = layer.r["default"], layer.scaling["default"]
+        if name.endswith(("lora_A.weight", "lora_A.default.weight")):
+            if len(factor) != rank:
+                where, remedy = f"{file}: r", "put in r and lora_alpha of the run that trained these factors"
+                raise CheckpointError.at(where, f"{len(factor)}, the rows of {module_of(name)}.lora_A", rank, remedy)
+        elif scale != 1:
+            found[name] = scale * factor.float()
+    return found
 
-    @classmethod
-    def of(cls, file: Path, config: Mapping[str, Any]) -> Scaling:
-        """Read a LoRA configuration. Raises CheckpointError for another adapter type."""
-        kind = config.get("peft_type", "LORA")
-        if kind != "LORA":
-            raise CheckpointError.at(f"{file}: peft_type", "LORA", shown(kind), MERGE)
-        rank, alpha = config.get("r"), config.get("lora_alpha")
-        is_number = isinstance(alpha, (int, float)) and not isinstance(alpha, bool) and math.isfinite(alpha)
-        if type(rank) is not int or rank < 1 or not is_number:
-            got = f"lora_alpha {shown(alpha)} and r {shown(rank)}"
-            raise CheckpointError.at(file, "lora_alpha and r of the LoRA weights", got)
-        unsupported = sorted(name for name, value in config.items() if value and name not in _HARMLESS)
-        if unsupported:
-            raise CheckpointError.at(file, "plain LoRA", cut(", ".join(unsupported)), MERGE)
-        return cls(file, rank, float(config["lora_alpha"]))
 
-    def scaled(self, factors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the factors, with alpha / r in B. Raises CheckpointError for a factor A, [r, D], with another rank."""
-        scale = self.alpha / self.rank
-        found = {}
-        for name, factor in factors.items():
-            is_a = name.endswith("lora_A.weight")
-            if is_a and len(factor) != self.rank:
-                where, remedy = f"{self.file}: r", "put in r and lora_alpha of the run that trained these factors"
-                got = f"{len(factor)}, the rows of {module_of(name)}.lora_A"
-                raise CheckpointError.at(where, got, self.rank, remedy)
-            found[name] = factor if is_a or scale == 1 else scale * factor.float()
-        return found
+def _layers(file: Path, config: Mapping[str, Any], backbone: dict[str, Any], root: str) -> dict[str, Any]:
+    """Return PEFT's layers by module, without weights. Raises CheckpointError for patterns that PEFT cannot apply."""
+    try:
+        from peft import LoraConfig, inject_adapter_in_model
+        from peft.tuners.lora import LoraLayer
+    except ImportError as error:
+        raise ImportError(f'LoRA needs PEFT: pip install ".[vlm]" ({error})') from error
+    with expecting("a configuration that PEFT applies", file):
+        with torch.device("meta"):
+            network: Any = build_backbone(BackboneConfig(backbone, "bfloat16"), torch.bfloat16)
+        wrapped = network if root == WHOLE else network.language_model
+        fields = _without_patterns(file, config, [name for name, _ in wrapped.named_modules() if name])
+        inject_adapter_in_model(LoraConfig(**fields), wrapped, low_cpu_mem_usage=True)
+    return {root + name: module for name, module in wrapped.named_modules() if isinstance(module, LoraLayer)}
 
-    def check_equal(self, other: Scaling) -> None:
-        """Raise CheckpointError if another file has other values."""
-        mine, its = (f"r {each.rank} and lora_alpha {each.alpha:g}" for each in (self, other))
-        if mine != its:
-            raise CheckpointError.at(other.file, f"{mine}, as {self.file} has it", its, "mend the wrong one")
+
+def _without_patterns(file: Path, config: Mapping[str, Any], modules: Sequence[str]) -> dict[str, Any]:
+    """Return the fields that PEFT applies, with the names of modules in place of patterns, in bounded time.
+
+    Raises CheckpointError for a pattern that is none, takes too long, or should change the scaling of no module.
+    """
+    import regex  # a dependency of transformers; Python's own has no time limit
+
+    end = time.monotonic() + _PATTERN_S
+
+    def matches(field: str, pattern: str, form: str = "{}") -> list[str]:
+        try:
+            compiled = regex.compile(form.format(pattern))
+            return [each for each in modules if compiled.fullmatch(each, timeout=max(end - time.monotonic(), 1e-3))]
+        except (TimeoutError, regex.error) as error:
+            got, remedy = f"{shown(pattern)}: {error}", "write the names of the modules in its place"
+            raise CheckpointError.at(f"{file}: {field}", "a pattern of names", got, remedy) from error
+
+    fields = {name: config[name] for name in _APPLIED if config.get(name) is not None}
+    for field in ("layers_pattern", "modules_to_save"):  # PEFT takes these as patterns, too
+        names = [fields[field]] if isinstance(fields.get(field), str) else fields.get(field, ())
+        if other := [name for name in names if not re.fullmatch(r"[\w.]*", name)]:
+            raise CheckpointError.at(f"{file}: {field}", "names of modules", shown(other[0]), MERGE)
+    for field in ("target_modules", "exclude_modules"):
+        if isinstance(fields.get(field), str) and fields[field] != "all-linear":
+            fields[field] = matches(field, fields[field])
+    for field in ("alpha_pattern", "rank_pattern"):
+        left, of_module = {*modules}, {}
+        for pattern, value in fields.get(field, {}).items():
+            if not (found := matches(field, pattern, r"(.*\.)?({})$")):
+                remedy = "remove it if it changed none in training, or merge the adapter there"
+                raise CheckpointError.at(
+                    f"{file}: {field}", "patterns of modules", f"{shown(pattern)}, of none", remedy
+                )
+            require(f"{file}: {field}", _is_number(value), "finite numbers", shown(value), CheckpointError)
+            if names := left.intersection(found):  # the first pattern counts
+                of_module[f"^(?:{'|'.join(map(re.escape, sorted(names)))})"] = value
+                left -= names
+        fields[field] = of_module
+    return fields
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def check_adapter(file: Path, config: Mapping[str, Any]) -> None:
-    """Raise CheckpointError for an adapter that may have changed weights that it does not contain."""
-    init, bias = config.get("init_lora_weights", True), config.get("bias", "none")
+    """Raise CheckpointError for an adapter that is no plain LoRA, or may have changed weights that it lacks."""
+    kind, init, bias = (
+        config.get(*each) for each in (("peft_type", "LORA"), ("init_lora_weights", True), ("bias", "none"))
+    )
+    if kind != "LORA":
+        raise CheckpointError.at(f"{file}: peft_type", "LORA", shown(kind), MERGE)
+    rank, alpha = config.get("r"), config.get("lora_alpha")
+    if type(rank) is not int or rank < 1 or not _is_number(alpha):  # PEFT has defaults
+        got = f"lora_alpha {shown(alpha)} and r {shown(rank)}"
+        raise CheckpointError.at(file, "lora_alpha and r of the LoRA weights", got)
+    if unsupported := sorted(name for name, value in config.items() if value and name not in (*_APPLIED, *_HARMLESS)):
+        raise CheckpointError.at(file, "plain LoRA", cut(", ".join(unsupported)), MERGE)
     if init not in _PLAIN_INITS:
         got = f"{shown(init)}, which may change the base model's weights before training"
         raise CheckpointError.at(f"{file}: init_lora_weights", "true", got, MERGE)
@@ -115,15 +176,31 @@ def check_adapter(file: Path, config: Mapping[str, Any]) -> None:
         raise CheckpointError.at(f"{file}: bias", "none", f"{shown(bias)}, which PEFT does not always save", MERGE)
 
 
-def check_inside(tensors: Mapping[str, Tensor], file: Path) -> bool:
-    """Return True if ``file`` holds LoRA factors among whole weights.
+def scaled_inside(
+    tensors: dict[str, Tensor], folder: Path, backbone: dict[str, Any], file: Path, config: Mapping[str, Any]
+) -> dict[str, Tensor]:
+    """Return whole weights, renamed, with scaled LoRA factors if there are any among them.
 
+    file, config: the run's LoRA configuration, with which PEFT's own in the folder must agree
     Raises CheckpointError for a base layer whose factors are missing.
     """
+    root = TEXT if any(name.startswith(f"{TEXT}base_model.") for name in tensors) else WHOLE
+    tensors = renamed(renamed(tensors, LORA_INSIDE), QWEN_NAMES)
     wrapped = {name.partition(BASE_LAYER)[0] for name in tensors if BASE_LAYER in name}
     present = {module_of(name) for name in tensors if LORA_NAME.fullmatch(name)}
-    check_none_lost(file, wrapped - present)
-    return bool(present)
+    check_none_lost(folder / WEIGHTS, wrapped - present)
+    if not present:
+        return tensors
+    check_adapter(file, config)
+    if is_there(own := folder / ADAPTER_CONFIG):
+        check_adapter(own, of_adapter := read_json(own))
+        of_run, its = (f"r {each['r']} and lora_alpha {each['lora_alpha']:g}" for each in (config, of_adapter))
+        if of_run != its:
+            raise CheckpointError.at(own, f"{of_run}, as {file} has it", its, "mend the wrong one")
+        file, config = own, of_adapter
+    targets = [module.removeprefix(root) for module in present if module.startswith(_PARTS)]
+    used = {name: tensor for name, tensor in tensors.items() if not name.startswith(_UNUSED_HEAD)}
+    return scaled(used, file, {**config, "target_modules": targets}, backbone, root)
 
 
 CUSTOM_HEADS = "custom_heads.safetensors"
@@ -138,6 +215,7 @@ _NO_EMBEDDING = (
 _OTHER = re.compile(r"\.(lora_embedding_[AB]|modules_to_save|original_module)(\.|$)")
 _BASE_NAMES = ((r"^language_model\.", "model.language_model."), *QWEN_NAMES)  # the first: saved without a head
 _PARTS = ("model.language_model.", "model.visual.")  # prefixes if the adapter wraps the whole model
+_UNUSED_HEAD = "model.lm_head."
 
 
 def has_adapter(folder: Path) -> bool:
@@ -155,36 +233,32 @@ def has_adapter(folder: Path) -> bool:
     return bool(adapter)
 
 
-def adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Tensor], Scaling]:
-    """Load an adapter and its base model: the backbone's configuration, all weights, and the factors' scaling.
+def adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Load an adapter and its base model: the backbone's configuration, and all weights with scaled LoRA factors.
 
     Raises CheckpointError.
     """
     file = folder / ADAPTER_CONFIG
     adapter_config = read_json(file)
-    scaling = Scaling.of(file, adapter_config)
     check_adapter(file, adapter_config)
     if not is_there(folder / ADAPTER_WEIGHTS):
-        refuse_pickles(folder, ADAPTER_WEIGHTS, Path(ADAPTER_WEIGHTS).stem)
+        refuse_pickles(folder, ADAPTER_WEIGHTS, [path.name for path in folder.iterdir()])
     tensors = renamed(read_tensors(folder / ADAPTER_WEIGHTS), ADAPTER_NAMES)
     root = WHOLE if any(name.startswith(_PARTS) for name in tensors) else TEXT
     adapter = renamed(tensors, QWEN_NAMES)
-    other = next((name for name in adapter if _OTHER.search(name)), None)
-    if other is not None:
+    if other := next((name for name in adapter if _OTHER.search(name)), None):
         expected = "LoRA factors of linear layers of a Qwen backbone"
         raise CheckpointError.at(folder / ADAPTER_WEIGHTS, expected, shown(other), MERGE)
     if EMBEDDING not in adapter:
         raise CheckpointError(f"{folder / ADAPTER_WEIGHTS}: {_NO_EMBEDDING}")
     config, base = _read_base(base_model)
-    factors = {name: tensor for name, tensor in adapter.items() if LORA_NAME.fullmatch(name)}
-    replaced = {name: tensor for name, tensor in adapter.items() if name not in factors}
-    unknown = sorted(replaced.keys() - base.keys())
-    if unknown:
+    replaced = {name for name in adapter if not LORA_NAME.fullmatch(name)}
+    if unknown := sorted(replaced - base.keys()):
         raise CheckpointError.at(folder / ADAPTER_WEIGHTS, f"weights of {base_model}", f"also {listed(unknown)}")
-    check_factors(file, adapter_config, set(map(module_of, factors)), base, root)
+    adapter = scaled(adapter, file, adapter_config, config, root)
     check_replaced(file, adapter_config, replaced, base)
-    config["text_config"]["vocab_size"] = len(replaced[EMBEDDING])
-    return config, base | replaced | factors | read_tensors(folder / CUSTOM_HEADS), scaling
+    config["text_config"]["vocab_size"] = len(adapter[EMBEDDING])
+    return config, base | adapter | read_tensors(folder / CUSTOM_HEADS)
 
 
 def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -211,19 +285,6 @@ def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     return config, {n: w.to(dtype) if dtype and w.is_floating_point() else w for n, w in weights.items()}
 
 
-def check_factors(
-    file: Path, config: Mapping[str, Any], present: set[str], weights: Mapping[str, Tensor], root: str
-) -> None:
-    """Raise CheckpointError if an adapter trained modules whose factors are missing.
-
-    file: states ``config``, the adapter's configuration
-    present: modules with factors
-    weights: weights of the whole network
-    root: prefix for the modules that PEFT wrapped
-    """
-    check_none_lost(file, _targeted(file, config, present, weights, root) - present)
-
-
 def check_none_lost(file: Path, lost: set[str]) -> None:
     """Raise CheckpointError if factors are lost. file: the file that names their modules, for the message."""
     if lost:
@@ -239,55 +300,3 @@ def check_replaced(file: Path, config: Mapping[str, Any], replaced: Iterable[str
     if missing := sorted(saved - set(replaced)):
         where, remedy = f"{file}: modules_to_save", "copy or save the adapter again where it was trained"
         raise CheckpointError.at(where, "the weights of each module", f"none for {listed(missing)}", remedy)
-
-
-def _targeted(
-    file: Path, config: Mapping[str, Any], present: set[str], weights: Mapping[str, Tensor], root: str
-) -> set[str]:
-    """Return the modules that ``config`` targets; if ``present`` has others, its module kinds in all layers."""
-    axes = {name.removesuffix(".weight"): tensor.dim() for name, tensor in weights.items() if name.endswith(".weight")}
-    modules = [module for module, dim in axes.items() if module.startswith(root) and dim > 1]
-    for prefix in (root, WHOLE, ""):
-        keys = {module.removeprefix(prefix): axes[module] for module in modules}
-        matched = _matched(file, config, keys)
-        found = {module for module in modules if module.removeprefix(prefix) in matched}
-        if found and present <= found:
-            return found
-    kinds = {_LAYER.sub(".*.", module, count=1) for module in present}
-    return {module for module in modules if _LAYER.sub(".*.", module, count=1) in kinds}
-
-
-def _matched(file: Path, config: Mapping[str, Any], keys: Mapping[str, int]) -> set[str]:
-    """Return the keys that ``target_modules`` names, minus its exceptions. keys: how many axes each weight has."""
-    wanted = config.get("target_modules") or []
-    linear = {key for key, dim in keys.items() if dim == 2 and "embed" not in key.rpartition(".")[2]}
-    found = linear if wanted == _ALL_LINEAR else _named(file, "target_modules", wanted, keys)
-    layers = config.get("layers_to_transform")
-    if isinstance(wanted, list) and layers not in (None, []):
-        numbers = layers if isinstance(layers, list) else [layers]
-        found = {key for key in found if key in wanted or _layer_of(key, config.get("layers_pattern")) in numbers}
-    saved = config.get("modules_to_save") or ()
-    found = {key for key in found if not any(f".{name}." in f".{key}." for name in saved)}
-    return found - _named(file, "exclude_modules", config.get("exclude_modules") or [], keys)
-
-
-def _named(file: Path, field: str, names: list[str] | str, keys: Iterable[str]) -> set[str]:
-    """Return the keys that end with one of ``names``, or that match it as a pattern."""
-    if not isinstance(names, str):
-        return {key for key in keys if any(f".{key}".endswith(f".{name}") for name in names)}
-    import regex  # a dependency of transformers; Python's own has no time limit
-
-    try:
-        return {key for key in keys if regex.fullmatch(names, key, timeout=_PATTERN_S)}
-    except (TimeoutError, regex.error) as error:
-        raise CheckpointError.at(f"{file}: {field}", "a pattern of names", f"{shown(names)}: {error}") from error
-
-
-def _layer_of(key: str, patterns: list[str] | str | None) -> int | None:
-    """Return the layer number in a key, behind one of the names ``patterns`` (none: behind any name)."""
-    names = [patterns] if isinstance(patterns, str) else patterns or [r"[^.]*"]
-    for name in names:
-        escaped = name if name == r"[^.]*" else re.escape(name)
-        if (found := re.match(rf"(?:^|.*?\.){escaped}\.(\d+)\.", key)) is not None:
-            return int(found[1])
-    return None

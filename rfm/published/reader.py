@@ -67,13 +67,14 @@ class Loaded:
     """A checkpoint as it was published, and what a user must know about it.
 
     assumptions: the settings that neither weights nor files prove
-    notes: returns one line for the user per contradiction to the known facts about training; raises CheckpointError
+    notes: returns, for the checkpoint, one line for the user per contradiction to the known facts about training;
+        raises CheckpointError
     encoders: returns the checkpoint's encoders, or None; raises CheckpointError if they are missing or do not fit
     """
 
     checkpoint: Checkpoint
     assumptions: Sequence[Assumption] = ()
-    notes: Callable[[], Sequence[str]] = list
+    notes: Callable[[Any], Sequence[str]] = lambda _checkpoint: ()
     encoders: Callable[[], FrameEncoders | None] = lambda: None
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,56 +36,21 @@ from rfm.published.run_config import MAX_COUNT, check_progress, find_run_config,
 from rfm.published.weights import has_head, read_weights, take_prefix
 from rfm_client.contract.checks import require
 
-# Upstream's encoders, whose embeddings ReWiND checkpoints are trained on, and the known settings in their files.
+# Upstream's encoders, whose embeddings ReWiND checkpoints are trained on, and the settings in their files.
 IMAGE_ENCODER = "facebook/dinov2-base"
 TEXT_ENCODER = "sentence-transformers/all-MiniLM-L12-v2"
-_SHARED_FIELDS = ("model_type", "hidden_size", "num_hidden_layers", "num_attention_heads")
-_IMAGE: dict[str, Any] = {
+_SHAPE = {"num_hidden_layers": 12, "num_attention_heads": 12}
+_IMAGE_SETTINGS: dict[str, Any] = {
     "model_type": "dinov2",
     "hidden_size": 768,
-    "num_hidden_layers": 12,
-    "num_attention_heads": 12,
     "patch_size": 14,
+    **_SHAPE,
     "resize_px": 256,
-    "crop_px": [224, 224],
-    "image_mean": [0.485, 0.456, 0.406],
-    "image_std": [0.229, 0.224, 0.225],
+    "crop_px": (224, 224),
+    "mean": (0.485, 0.456, 0.406),
+    "std": (0.229, 0.224, 0.225),
 }
-_TEXT: dict[str, Any] = {
-    "model_type": "bert",
-    "hidden_size": 384,
-    "num_hidden_layers": 12,
-    "num_attention_heads": 12,
-    "vocab_size": 30522,
-}
-
-
-def image_facts(source: str) -> dict[str, Any]:
-    """Return the settings in an image encoder's files, as JSON. Raises OSError, ValueError, CheckpointError."""
-    config, images = load_config(source, IMAGE_MODELS), load_preprocessor(source)
-    of_images = {
-        "resize_px": images.resize_px,
-        "crop_px": list(images.crop_px),
-        "image_mean": list(images.mean),
-        "image_std": list(images.std),
-    }
-    return {name: getattr(config, name, None) for name in (*_SHARED_FIELDS, "patch_size")} | of_images
-
-
-def text_facts(source: str) -> dict[str, Any]:
-    """Return the settings in a text encoder's files, as JSON. Raises OSError, ValueError, CheckpointError."""
-    config = load_config(source, TEXT_MODELS)
-    return {name: getattr(config, name, None) for name in (*_SHARED_FIELDS, "vocab_size")}
-
-
-def differences(facts: dict[str, Any]) -> list[str]:
-    """Return the differences between upstream's encoder and another with the same width."""
-    known = _IMAGE if "crop_px" in facts else _TEXT
-    if facts["hidden_size"] != known["hidden_size"]:
-        return []
-    return [f"{name}: expected {known[name]}, got {facts[name]}" for name in known if facts[name] != known[name]]
-
-
+_TEXT_SETTINGS: dict[str, Any] = {"model_type": "bert", "hidden_size": 384, "vocab_size": 30522, **_SHAPE}
 IMAGE_ENCODER_PREFIX = "image_encoder."
 TEXT_ENCODER_PREFIX = "text_encoder."
 # Upstream's configurations from before causal_mask state all these fields; no network had a causal mask then.
@@ -102,91 +67,76 @@ _FIRST_CODES_UNREAD = "class_token"  # a parameter that the network never reads
 _FIRST_CODES_SETTINGS = {"num_attention_heads": 8, "causal_mask": True, "max_len": 16}
 
 
-@dataclass(frozen=True)
-class PretrainedEncoders:
-    """The encoders for a published checkpoint, which no training run file names.
-
-    image_source, text_source: folders or ids that the user named; None: upstream's
-    """
-
-    checkpoint: RewindCheckpoint
-    image_source: str | None = None
-    text_source: str | None = None
-
-    @property
-    def _are_used(self) -> bool:
-        """True if the checkpoint has encoder weights, or the user named an encoder."""
-        own = self.checkpoint
-        return any(map(bool, (own.image_encoder, own.text_encoder, self.image_source, self.text_source)))
-
-    @property
-    def _sources(self) -> tuple[str, str]:
-        return self.image_source or IMAGE_ENCODER, self.text_source or TEXT_ENCODER
-
-    def notes(self) -> list[str]:
-        """Return one line per encoder that differs from upstream's with the same width."""
-        if not self._are_used:
-            return []
-        compared = zip((IMAGE_ENCODER, TEXT_ENCODER), self._sources, map(differences, self._facts()), strict=True)
-        return [
-            f"{source}: differs from upstream's {known} in {'; '.join(found)}: scores are right only if the run's "
-            "embeddings were made with it"
-            for known, source, found in compared
-            if found
-        ]
-
-    @property
-    def assumptions(self) -> list[Assumption]:
-        """The encoders that will be used, which no file proves."""
-        found = []
-        own = (self.checkpoint.image_encoder, self.checkpoint.text_encoder)
-        named = (self.image_source, self.text_source)
-        encoders = zip(("image", "text"), self._sources, named, own, strict=True) if self._are_used else ()
-        for kind, source, option, weights in encoders:
-            given = f"--{kind}-encoder" if option else UPSTREAM_DEFAULT
-            whose = "weights of the checkpoint" if weights else "only its width agrees"
-            found.append(Assumption(f"{kind}_encoder", source_name(source), f"{given}; {whose}"))
-        return found
-
-    def _facts(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        image_source, text_source = self._sources
-        with self._having_encoders():
-            return image_facts(image_source), text_facts(text_source)
-
-    def load(self) -> Encoders | None:
-        """Return the encoders if the checkpoint has their weights or the user names them, otherwise None.
-
-        Raises CheckpointError if they are missing or do not fit the network.
-        """
-        if not self._are_used:
-            return None
-        own = self.checkpoint
-        with self._having_encoders():
-            encoders = Encoders.from_pretrained(
-                *self._sources, image_weights=own.image_encoder or None, text_weights=own.text_encoder or None
-            )
-        widths, expected = (encoders.video_feature_dim, encoders.text_feature_dim), own.description.widths
-        if widths != expected:
-            raise CheckpointError.at(f"encoders {' and '.join(self._sources)}", f"widths {expected}", widths)
-        return encoders
-
-    @contextmanager
-    def _having_encoders(self) -> Iterator[None]:
-        try:
-            yield
-        except misfits(ImportError, OSError) as error:
-            absent = [source for source in self._sources if not Path(source).is_dir()]
-            here = f"; there is no folder {' nor '.join(absent)} either" if absent else ""
-            hint = f"name local folders with --image-encoder and --text-encoder{here}"
-            raise CheckpointError(f"encoders {' and '.join(self._sources)}: {cut(str(error))} ({hint})") from error
-
-
 def _loaded(
-    checkpoint: RewindCheckpoint, assumed: tuple[Assumption, ...], sources: tuple[str | None, str | None] = (None, None)
+    checkpoint: RewindCheckpoint, assumed: tuple[Assumption, ...], named: tuple[str | None, str | None] = (None, None)
 ) -> Loaded:
+    """Return the checkpoint with its encoders, if it has their weights or the user names them, which no file proves.
+
+    named: folders or ids of image encoder and text encoder; None: upstream's
+    """
     checkpoint.check()
-    encoders = PretrainedEncoders(checkpoint, *sources)
-    return Loaded(checkpoint, (*assumed, *encoders.assumptions), encoders.notes, encoders.load)
+    own = checkpoint.image_encoder, checkpoint.text_encoder
+    if not any((*own, *named)):
+        return Loaded(checkpoint, assumed)
+    sources = named[0] or IMAGE_ENCODER, named[1] or TEXT_ENCODER
+    of_encoders = []
+    for kind, source, option, weights in zip(("image", "text"), sources, named, own, strict=True):
+        given = f"--{kind}-encoder" if option else UPSTREAM_DEFAULT
+        whose = "weights of the checkpoint" if weights else "only its width agrees"
+        of_encoders.append(Assumption(f"{kind}_encoder", source_name(source), f"{given}; {whose}"))
+    load = partial(_encoders, checkpoint, sources)
+    return Loaded(checkpoint, (*assumed, *of_encoders), lambda _checkpoint: _encoder_notes(sources), load)
+
+
+def _encoder_notes(sources: tuple[str, str]) -> list[str]:
+    """Return one line per encoder that differs from upstream's with the same width. Raises CheckpointError."""
+    with _having_encoders(sources):
+        found = image_differences(sources[0]), text_differences(sources[1])
+    return [
+        f"{source}: differs from upstream's {known} in {'; '.join(lines)}: scores are right only if the run's "
+        "embeddings were made with it"
+        for known, source, lines in zip((IMAGE_ENCODER, TEXT_ENCODER), sources, found, strict=True)
+        if lines
+    ]
+
+
+def image_differences(source: str) -> list[str]:
+    """Return the differences between upstream's image encoder and another with its width, by their files."""
+    return _differences(_IMAGE_SETTINGS, load_config(source, IMAGE_MODELS), load_preprocessor(source))
+
+
+def text_differences(source: str) -> list[str]:
+    """Return the differences between upstream's text encoder and another with its width, by their files."""
+    return _differences(_TEXT_SETTINGS, load_config(source, TEXT_MODELS))
+
+
+def _differences(known: Mapping[str, Any], *files: Any) -> list[str]:
+    got = {name: next((getattr(file, name) for file in files if hasattr(file, name)), None) for name in known}
+    if got["hidden_size"] != known["hidden_size"]:
+        return []  # another encoder, as the weights' shapes tell
+    return [f"{name}: expected {known[name]}, got {got[name]}" for name in known if got[name] != known[name]]
+
+
+def _encoders(checkpoint: RewindCheckpoint, sources: tuple[str, str]) -> Encoders:
+    """Load a checkpoint's encoders. Raises CheckpointError if they are missing or do not fit the network."""
+    with _having_encoders(sources):
+        encoders = Encoders.from_pretrained(
+            *sources, image_weights=checkpoint.image_encoder or None, text_weights=checkpoint.text_encoder or None
+        )
+    widths, expected = (encoders.video_feature_dim, encoders.text_feature_dim), checkpoint.description.widths
+    require(f"encoders {' and '.join(sources)}", widths == expected, f"widths {expected}", widths, CheckpointError)
+    return encoders
+
+
+@contextmanager
+def _having_encoders(sources: tuple[str, str]) -> Iterator[None]:
+    try:
+        yield
+    except misfits(ImportError, OSError) as error:
+        absent = [source for source in sources if not Path(source).is_dir()]
+        here = f"; there is no folder {' nor '.join(absent)} either" if absent else ""
+        hint = f"name local folders with --image-encoder and --text-encoder{here}"
+        raise CheckpointError(f"encoders {' and '.join(sources)}: {cut(str(error))} ({hint})") from error
 
 
 def reads(folder: Path) -> bool:

@@ -35,7 +35,7 @@ def load(folder: Path, options: CheckpointConfig) -> Loaded:
         _, preprocessor = read_processor(files.processor)
         limits = pixel_limits(preprocessor, f"base model {files.processor}")
         config = RoboDopamineConfig(**{**files.made_of, **limits}, stops=stops_of(folder))
-        assumptions = files.assumptions(config)
+        assumptions = files.assumed_but("video_prompt")
         checkpoint = RoboDopamineCheckpoint(config, files.weights, files.processor)
     config = replace(checkpoint.config, **given)
     config.check()

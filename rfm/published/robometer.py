@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -16,30 +17,25 @@ from torch import Tensor
 
 from rfm.config import CheckpointConfig
 from rfm.families.robometer.checkpoint import VlmCheckpoint, restore
-from rfm.families.robometer.collator import VlmCollator
 from rfm.families.robometer.network import VlmConfig
-from rfm.families.robometer.prompts import OLD_RUN_REMEDY
+from rfm.families.robometer.prompts import OLD_RUN_REMEDY, VlmCollator
 from rfm.files import (
     ADAPTER_CONFIG,
     NETWORK_CONFIG,
-    WEIGHTS,
     CheckpointError,
     expecting,
     is_there,
     network_config,
     read_json,
 )
-from rfm.published.lora import Scaling, adapted, check_inside, has_adapter
+from rfm.published.lora import adapted, has_adapter, scaled_inside
 from rfm.published.provenance import Assumption
 from rfm.published.qwen import (
-    LORA_INSIDE,
-    QWEN_NAMES,
     UNQUANTIZED,
     UNUSED,
     backbone_config,
     check_not_quantized,
     decided,
-    renamed,
 )
 from rfm.published.reader import Loaded, Reader
 from rfm.published.robometer_run import (
@@ -52,49 +48,13 @@ from rfm.published.robometer_run import (
     lerobot_run,
     lerobot_weights,
 )
-from rfm.published.rounding import kind_of, read_published, read_unrounded_config, rounded_as_asked
+from rfm.published.rounding import kind_of, read_published, read_unrounded_config
 from rfm.published.run_config import check_progress
 from rfm.published.weights import has_head, read_weights
 from rfm.qwen.collator import Chat, Visual
 from rfm.qwen.lora import changed_by, split
 from rfm.qwen.network import BACKBONES, QWEN3, QWEN_2_5
 from rfm.saved import PROCESSOR_FOLDER, is_saved
-
-
-@dataclass(frozen=True)
-class PublishedVlm(VlmCheckpoint):
-    """A checkpoint as it was published.
-
-    base_model: folder or id from the caller; None: as the checkpoint names it
-    has_processor: the processor is the checkpoint's own
-    """
-
-    base_model: str | None = None
-    has_processor: bool = False
-
-    def load_collator(self) -> VlmCollator:
-        """Return the collator. Raises CheckpointError if the caller's base model differs from the run's."""
-        collator = super().load_collator()
-        if self.base_model is not None and _is_published(self.config.base_model_id, self.config.family):
-            _check_published(collator, self.base_model)
-        return collator
-
-    def notes(self) -> list[str]:
-        """Return one line per sign that prompts, images or positions differ from those in training."""
-        lines = []
-        if not self.has_processor and (found := _differences(self.collator)):
-            known = f"the published processors of {self.config.family}"
-            lines.append(f"base model {self.processor}: differs from {known} in {'; '.join(found)}")
-        version = str(self.config.backbone.get("transformers_version"))
-        major = version.partition(".")[0]
-        reads_videos = self.config.family == QWEN_2_5 and not self.config.multi_image
-        if reads_videos and major.isdigit() and int(major) >= 5:
-            lines.append(
-                f"{NETWORK_CONFIG}: transformers_version is {version}: text behind a video stands where transformers 4 "
-                "puts it; if the run was trained with transformers 5, which puts it elsewhere, scores differ from the "
-                "run's"
-            )
-        return lines
 
 
 def reads(folder: Path) -> bool:
@@ -108,52 +68,62 @@ def reads(folder: Path) -> bool:
 
 def load(folder: Path, options: CheckpointConfig) -> Loaded:
     """Load a checkpoint from a local folder. Raises CheckpointError."""
-    assumptions: tuple[Assumption, ...] = ()
-    if is_saved(folder):
-        parts = _exported(folder)
-    else:
-        parts, assumptions = _published(folder, options)
-    config, weights, factors, processor = parts
-    config, weights, factors = rounded_as_asked(config, weights, factors, options.weights)
-    base = options.base_model
-    has_processor = base is None and isinstance(processor, Path)
-    checkpoint = PublishedVlm(config, weights, base or processor, factors, base, has_processor)
+    checkpoint, assumptions = (restore(folder), ()) if is_saved(folder) else _published(folder, options)
+    base_model, config = options.base_model, checkpoint.config
+    has_processor = base_model is None and isinstance(checkpoint.processor, Path)
+    checkpoint = replace(checkpoint, processor=base_model or checkpoint.processor)
     checkpoint.check()
-    return Loaded(checkpoint, assumptions, checkpoint.notes)
+    if base_model is not None and re.fullmatch(_PUBLISHED_NAMES[config.family], config.base_model_id):
+        _check_published(checkpoint.collator, base_model)
+    return Loaded(checkpoint, assumptions, partial(_notes, has_processor=has_processor))
 
 
-_Parts: TypeAlias = tuple[VlmConfig, dict[str, Tensor], dict[str, Tensor], str | Path]
+def _check_published(collator: VlmCollator, processor: str) -> None:
+    """Raise CheckpointError if a processor that replaces the published one differs from it."""
+    if found := _differences(collator):
+        named = collator.config.base_model_id
+        raise CheckpointError(
+            f"base model {processor}: expected a processor like that of {named}, which the run names: "
+            f"{'; '.join(found)}; name a folder with the files of {named} with --base-model, or correct "
+            "model.base_model_id of the run's config.yaml"
+        )
+
+
+def _notes(checkpoint: VlmCheckpoint, *, has_processor: bool) -> list[str]:
+    """Return one line per sign that prompts, images or positions differ from those in training.
+
+    has_processor: the processor is the checkpoint's own
+    """
+    config, lines = checkpoint.config, []
+    if not has_processor and (found := _differences(checkpoint.collator)):
+        known = f"the published processors of {config.family}"
+        lines.append(f"base model {checkpoint.processor}: differs from {known} in {'; '.join(found)}")
+    version = str(config.backbone.get("transformers_version"))
+    major = version.partition(".")[0]
+    if config.family == QWEN_2_5 and not config.multi_image and major.isdigit() and int(major) >= 5:
+        lines.append(
+            f"{NETWORK_CONFIG}: transformers_version is {version}: text behind a video stands where transformers 4 "
+            "puts it; if the run was trained with transformers 5, which puts it elsewhere, scores differ from the "
+            "run's"
+        )
+    return lines
+
+
 _Read: TypeAlias = tuple[VlmConfig, dict[str, Tensor], dict[str, Tensor], tuple[Assumption, ...]]
 
 
-def _exported(folder: Path) -> _Parts:
-    """Return an export's parts; the caller may change its processor and weight format."""
-    restored = restore(folder)
-    return restored.config, restored.weights, restored.factors, restored.processor
-
-
-def _published(folder: Path, options: CheckpointConfig) -> tuple[_Parts, tuple[Assumption, ...]]:
+def _published(folder: Path, options: CheckpointConfig) -> tuple[VlmCheckpoint, tuple[Assumption, ...]]:
     with expecting("a vision-language checkpoint", folder):
         content = {} if has_adapter(folder) else read_json(folder / NETWORK_CONFIG)
         read = _by_lerobot if is_lerobot(content) else _trained
         config, weights, factors, assumptions = read(folder, content, options.base_model)
         if config.family == QWEN3 and not config.multi_image:
-            config, form = _with_video_prompt(config, content, options)
-            assumptions = (*assumptions, *form)
+            file = f"{NETWORK_CONFIG}: {LEROBOT_BACKBONE}" if is_lerobot(content) else NETWORK_CONFIG
+            # An adapter has no config.json: another transformers may have saved its base model.
+            form, of_form = decided(options.video_prompt, config.backbone if content else {}, file)
+            config, assumptions = replace(config, video_prompt=form), (*assumptions, *of_form)
     own = folder / PROCESSOR_FOLDER
-    return (config, weights, factors, own if own.is_dir() else config.base_model_id), assumptions
-
-
-def _with_video_prompt(
-    config: VlmConfig, content: Mapping[str, Any], options: CheckpointConfig
-) -> tuple[VlmConfig, tuple[Assumption, ...]]:
-    """Return the configuration with the form of its video prompts, and the form if it is assumed.
-
-    content: the run's config.json; empty for an adapter, whose base model another transformers may have saved
-    """
-    file = f"{NETWORK_CONFIG}: {LEROBOT_BACKBONE}" if is_lerobot(content) else NETWORK_CONFIG
-    form, assumed = decided(options.video_prompt, config.backbone if content else {}, file)
-    return replace(config, video_prompt=form), assumed
+    return VlmCheckpoint(config, weights, own if own.is_dir() else config.base_model_id, factors), assumptions
 
 
 def _by_lerobot(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Read:
@@ -176,13 +146,12 @@ def _trained(folder: Path, content: Mapping[str, Any], base_model: str | None) -
     run = RunConfig.of(folder)
     run.check_model_type()
     check_progress(run.sections, run.file)
-    scaling: Scaling | None
     if content:
         tensors, num_nf4 = read_published(folder, is_nf4)
-        tensors, scaling = _whole(tensors, folder, backbone, run)
+        tensors = scaled_inside(tensors, folder, backbone, run.file, run.sections["peft"])
     else:
-        backbone, tensors, scaling = adapted(folder, base_model or base_of_adapter(folder, run))
-    weights, factors = _used(tensors, scaling)
+        backbone, tensors = adapted(folder, base_model or base_of_adapter(folder, run))
+    weights, factors = _used(tensors)
     config = _config(folder, backbone, run, weights)
     return config, weights, factors, assumptions_of(config, run, base_model, num_nf4)
 
@@ -196,7 +165,7 @@ def _config(
     if "progress_head.4.weight" not in weights:
         raise CheckpointError.at(folder, "reward heads", "no progress_head.4.weight")
     if "frame_pool_attn.weight" not in weights:
-        raise CheckpointError.at(folder, "frame_pool_attn.weight", f"none: {OLD_RUN_REMEDY}")
+        raise CheckpointError.at(folder, "frame_pool_attn.weight", "none", OLD_RUN_REMEDY)
     network = run.network()
     config = VlmConfig(
         backbone=backbone,
@@ -214,79 +183,34 @@ def _config(
     return config
 
 
-def _whole(
-    tensors: dict[str, Tensor], folder: Path, backbone: Mapping[str, Any], run: RunConfig
-) -> tuple[dict[str, Tensor], Scaling | None]:
-    """Return whole weights, renamed, with LoRA factors among them, and the factors' scaling if there are any."""
-    scaling = None
-    if check_inside(tensors, folder / WEIGHTS):
-        tensors, scaling = renamed(tensors, LORA_INSIDE), Scaling.of(run.file, run.sections["peft"])
-        if is_there(folder / ADAPTER_CONFIG):
-            scaling.check_equal(Scaling.of(folder / ADAPTER_CONFIG, read_json(folder / ADAPTER_CONFIG)))
-    return renamed(tensors, QWEN_NAMES), scaling
-
-
-def _used(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Return the weights that scores depend on, and their LoRA factors; ``scaling``: for these."""
+def _used(tensors: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Return the weights that scores depend on, and their LoRA factors."""
     weights, factors = split(tensors)
-    factors = factors if scaling is None else scaling.scaled(factors)
     weights = {name: tensor for name, tensor in weights.items() if not UNUSED.fullmatch(name)}
     return weights, {name: tensor for name, tensor in factors.items() if changed_by(name) in weights}
 
 
-# The published processors by backbone family, with which a run's own is compared.
-_EXAMPLE = "TASK"
+# The published processors by backbone family, with which another is compared.
+_PUBLISHED_NAMES = {QWEN_2_5: r"Qwen/Qwen2\.5-VL-\w+-Instruct", QWEN3: r"Qwen/Qwen3-VL-\w+-Instruct"}
 _QWEN_PROMPT = "<|im_start|>user\nTASK{visual} 1: <|vision_start|><|{pad}_pad|><|vision_end|><|im_end|>\n"
-_PUBLISHED_NAMES = {
-    QWEN_2_5: r"Qwen/Qwen2\.5-VL-\w+-Instruct",
-    QWEN3: r"Qwen/Qwen3-VL-\w+-Instruct",
-}
 _FACTS: dict[str, dict[str, Any]] = {
     QWEN_2_5: {
         "prompt": f"<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n{_QWEN_PROMPT}",
-        "patch_size": 14,
-        "image_mean": [0.48145466, 0.4578275, 0.40821073],
-        "image_std": [0.26862954, 0.26130258, 0.27577711],
+        "image_mean": (0.48145466, 0.4578275, 0.40821073),
+        "image_std": (0.26862954, 0.26130258, 0.27577711),
     },
-    QWEN3: {"prompt": _QWEN_PROMPT, "patch_size": 16, "image_mean": [0.5] * 3, "image_std": [0.5] * 3},
+    QWEN3: {"prompt": _QWEN_PROMPT, "image_mean": (0.5,) * 3, "image_std": (0.5,) * 3},
 }
-
-
-def _is_published(base_model_id: str, family: str) -> bool:
-    """True for a base model whose published processor is known."""
-    return re.fullmatch(_PUBLISHED_NAMES[family], base_model_id) is not None
-
-
-def _facts(collator: VlmCollator) -> dict[str, Any]:
-    """Return a processor's effect as JSON: a conversation's text with an image or video, and image settings."""
-    visual = Visual.IMAGE if collator.config.multi_image else Visual.VIDEO
-    images = {**collator.images.to_config()}
-    del images["rescale_factor"]  # the same for every processor that loads
-    for name in ("image_mean", "image_std"):
-        images[name] = list(images[name])
-    return {"prompt": Chat(collator.tokenizer).text((_EXAMPLE, visual)), **images}
-
-
-def _check_published(collator: VlmCollator, processor: str) -> None:
-    """Raise CheckpointError if a processor that replaces a published one differs from it."""
-    found = _differences(collator)
-    if found:
-        named = collator.config.base_model_id
-        raise CheckpointError(
-            f"base model {processor}: expected a processor like that of {named}, which the run names: "
-            f"{'; '.join(found)}; name a folder with the files of {named} with --base-model, or correct "
-            "model.base_model_id of the run's config.yaml"
-        )
 
 
 def _differences(collator: VlmCollator) -> list[str]:
     """Return the differences between a processor and those published for its backbone family."""
-    words = (
-        {"visual": "Picture", "pad": "image"} if collator.config.multi_image else {"visual": "Video", "pad": "video"}
-    )
+    is_image = collator.config.multi_image
+    words = {"visual": "Picture", "pad": "image"} if is_image else {"visual": "Video", "pad": "video"}
     known = {**_FACTS[collator.config.family]}
     known["prompt"] = known["prompt"].format(**words)
-    got = _facts(collator)
+    text = Chat(collator.tokenizer).text(("TASK", Visual.IMAGE if is_image else Visual.VIDEO))
+    got = {"prompt": text, **collator.images.to_config()}
     return [f"{name}: expected {value!r}, got {got[name]!r}" for name, value in known.items() if got[name] != value]
 
 

@@ -28,7 +28,7 @@ from rfm.files import (
 )
 from rfm.published.provenance import UPSTREAM_DEFAULT, Assumption, file_name, source_name
 from rfm.published.qwen import Renames, renamed
-from rfm.published.run_config import find_run_config, frame_count
+from rfm.published.run_config import check_lerobot, find_run_config, frame_count
 from rfm.qwen.lora import MERGE
 from rfm.qwen.network import QWEN_2_5, Dtype
 from rfm_client.contract.checks import require
@@ -94,14 +94,9 @@ class RunConfig:
 
     def check_model_type(self) -> None:
         """Raise CheckpointError for a checkpoint without reward heads, or with prompts that upstream has dropped."""
-        model_type, why = self.get("model.model_type", HEADS), ""
-        if model_type == VQA:
-            why = (
-                ": such a checkpoint answers in generated text, upstream's server and its training collator prompt it "
-                "in different ways, and upstream's successor dropped the type"
-            )
-        if model_type != HEADS:
-            raise CheckpointError.at(f"{self.file}: model.model_type", HEADS, f"{shown(model_type)}{why}")
+        if (model_type := self.get("model.model_type", HEADS)) != HEADS:
+            remedy = "models that answer in generated text are not served" if model_type == VQA else ""
+            raise CheckpointError.at(f"{self.file}: model.model_type", HEADS, shown(model_type), remedy)
         for section in ("model", "data"):
             for key in _DROPPED:
                 if self.get(f"{section}.{key}", False):
@@ -253,12 +248,6 @@ _DECIDING = {
     "data": ("max_frames",),
 }  # fmt: skip
 _BINS, _LOSS, _LOSSES = "progress_discrete_bins", "progress_loss_type", ("discrete", "l1", "l2")
-# Keys about LeRobot's own pipelines and uploads.
-_LEROBOT_IDLE = {
-    "default_task", "device", "image_key", "input_features", "license", "normalization_mapping", "output_features",
-    "pretrained_path", "pretrained_revision", "private", "push_to_hub", "repo_id", "reward_output",
-    "success_threshold", "tags", "task_key", "type",
-}  # fmt: skip
 
 
 def is_lerobot(content: Mapping[str, Any]) -> bool:
@@ -268,13 +257,8 @@ def is_lerobot(content: Mapping[str, Any]) -> bool:
 
 def lerobot_run(content: Mapping[str, Any], file: Path) -> RunConfig:
     """Return the settings in LeRobot's config.json. Raises CheckpointError for a missing, null or unknown key."""
-    known = {LEROBOT_BACKBONE, _BINS, _LOSS, *_LEROBOT_IDLE, *(key for keys in _DECIDING.values() for key in keys)}
-    if unknown := sorted(content.keys() - known):
-        remedy = "if it changes no score, remove it"
-        raise CheckpointError.at(file, "the keys of LeRobot's Robometer", shown(unknown[0]), remedy)
-    for key in (LEROBOT_BACKBONE, *_DECIDING["model"]):
-        if content.get(key) is None:
-            raise CheckpointError.at(f"{file}: {key}", "a value", "none", "save the model with LeRobot again")
+    needed = (LEROBOT_BACKBONE, *_DECIDING["model"])
+    check_lerobot(content, file, needed, {_BINS, _LOSS, "max_frames", "reward_output"})
     sections = {name: {key: content.get(key) for key in keys} for name, keys in _DECIDING.items()}
     sections["data"] |= {"resized_height": None, "resized_width": None}  # LeRobot has no common frame size
     return RunConfig(file, NETWORK_CONFIG, {"training": {}, "peft": {}, **sections}, has_sections=False)

@@ -34,7 +34,7 @@ def load(folder: Path, options: CheckpointConfig) -> Loaded:
         files = LanguageFolder.read(folder, options)
         made_of = {**files.made_of, "dtype": "bfloat16"}  # as the original loads it, whatever config.json says
         config = RoboRewardConfig(**made_of, stops=stops_of(folder), is_expected=name == EXPECTED)
-        assumptions = tuple(each for each in files.assumptions(config) if each.name != "dtype")
+        assumptions = files.assumed_but("dtype")
         checkpoint = RoboRewardCheckpoint(config, files.weights, files.processor)
     if options.strict_answers and not checkpoint.config.is_expected:
         checkpoint = replace(checkpoint, config=replace(checkpoint.config, strict_answers=True))

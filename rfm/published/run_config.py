@@ -20,6 +20,7 @@ from rfm.files import (
     read_run_config,
     shown,
 )
+from rfm.published.provenance import snapshot_of
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -63,9 +64,8 @@ def _check_base(file: Path, folder: Path) -> None:
 
 def _places_on_main(home: Path) -> list[Path]:
     """Return ``home`` (and its parent, for a subfolder) in main's snapshot in the Hub's cache."""
-    snapshot = next((path for path in (home, *home.parents) if path.parent.name == "snapshots"), home)
-    main = snapshot.parent.parent / "refs" / "main"
-    if snapshot.parent.name != "snapshots" or not is_there(main):
+    snapshot = snapshot_of(home)
+    if snapshot is None or not is_there(main := snapshot.parent.parent / "refs" / "main"):
         return []
     with main.open("rb") as file:
         commit = file.read(_COMMIT_DIGITS + 1)
@@ -154,6 +154,26 @@ def training_notes(folder: Path, answered: Collection[str]) -> list[str]:
             "rounded alike"
         )
     return lines
+
+
+# Keys in a config.json of LeRobot's reward models about LeRobot's own pipelines and uploads.
+_LEROBOT_IDLE = {
+    "default_task", "device", "image_key", "input_features", "license", "normalization_mapping", "output_features",
+    "pretrained_path", "pretrained_revision", "private", "push_to_hub", "repo_id", "success_threshold", "tags",
+    "task_key", "type",
+}  # fmt: skip
+
+
+def check_lerobot(content: Mapping[str, Any], file: Path, needed: Collection[str], known: Collection[str]) -> None:
+    """Raise CheckpointError for a key in LeRobot's config.json that is missing, null or unknown.
+
+    needed, known: keys that must have a value, and keys that may be there
+    """
+    if unknown := sorted(content.keys() - _LEROBOT_IDLE - {*needed, *known}):
+        expected = f"the keys of LeRobot's {content['type']}"
+        raise CheckpointError.at(file, expected, shown(unknown[0]), "if it changes no score, remove it")
+    if missing := [key for key in needed if content.get(key) is None]:
+        raise CheckpointError.at(f"{file}: {missing[0]}", "a value", "none", "save the model with LeRobot again")
 
 
 def constant_heads(weights: Mapping[str, Tensor], answered: Collection[str]) -> list[str]:

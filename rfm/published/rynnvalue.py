@@ -5,23 +5,21 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
-
-from torch import Tensor
 
 from rfm.config import CheckpointConfig
 from rfm.families.rynnvalue.checkpoint import RynnCheckpoint
 from rfm.families.rynnvalue.network import ACTIVATIONS, Bins, HeadConfig, RynnConfig, Transform
 from rfm.families.rynnvalue.prompts import META, RELATIVE_TOKEN, VALUE_TOKEN
 from rfm.files import NETWORK_CONFIG, CheckpointError, is_there, network_config, read_json, shown
-from rfm.published.language import dtype_of
+from rfm.published.language import dtype_of, reopened
 from rfm.published.provenance import Assumption, source_name
 from rfm.published.qwen import QWEN_NAMES, UNUSED, backbone_config, renamed
 from rfm.published.reader import Loaded, Reader
-from rfm.published.rounding import read_published, read_unrounded_config, rounded_as_asked
+from rfm.published.rounding import read_published, read_unrounded_config
 from rfm.qwen.language import EMBEDDING
 from rfm.qwen.network import QWEN3
 from rfm.qwen.processor import PROCESSOR_CONFIG, pixel_limits, read_processor
@@ -83,9 +81,10 @@ class Settings:
 
     def fields(self) -> dict[str, Any]:
         """Return the fields of RynnConfig that these files decide. Raises CheckpointError."""
+        attention = self._one_of("attn_implementation", self._value("attn_implementation"), (ISOLATED, *_CAUSAL))
         return {
-            "attention": self._attention(),
-            "num_heads": self._count("num_value_heads"),
+            "attention": "isolated" if attention == ISOLATED else "causal",
+            "num_heads": self._whole("num_value_heads", self._value("num_value_heads")),
             "value_copies": self._copies("value_token_repeat"),
             "relative_copies": self._copies("relative_value_token_repeat"),
             "value_head": self._head("value_head_config"),
@@ -110,12 +109,15 @@ class Settings:
     def _file(self) -> Path:
         return self.folder / NETWORK_CONFIG
 
-    def _attention(self) -> str:
-        stated = self._value("attn_implementation")
-        if stated != ISOLATED and stated not in _CAUSAL:
-            expected = f"{ISOLATED} or one of {', '.join(_CAUSAL)}"
-            raise CheckpointError.at(f"{self._file}: attn_implementation", expected, shown(stated))
-        return "isolated" if stated == ISOLATED else "causal"
+    def _one_of(self, key: str, value: Any, known: Iterable[str]) -> str:
+        if value not in [*known]:
+            raise CheckpointError.at(f"{self._file}: {key}", f"one of {', '.join(known)}", shown(value))
+        return str(value)
+
+    def _whole(self, key: str, value: Any, least: int = 1) -> int:
+        if type(value) is not int or value < least:
+            raise CheckpointError.at(f"{self._file}: {key}", f"a whole number of at least {least}", shown(value))
+        return value
 
     def _use_meta(self) -> bool:
         stated = self.processor.get("use_meta")
@@ -129,40 +131,24 @@ class Settings:
             raise CheckpointError.at(f"{self.folder / PROCESSOR_CONFIG}: conversation_style", _STYLE, shown(stated))
 
     def _copies(self, key: str) -> int:
-        count, other = self._count(key), self.processor.get(key)
+        count, other = self._whole(key, self._value(key)), self.processor.get(key)
         if other not in (None, count):
             where = f"{self.folder / PROCESSOR_CONFIG}: {key}"
             raise CheckpointError.at(where, f"{count}, as in {NETWORK_CONFIG}", shown(other), _COPY)
         return count
 
-    def _count(self, key: str) -> int:
-        value = self._value(key)
-        if type(value) is not int or value < 1:
-            raise CheckpointError.at(f"{self._file}: {key}", "a whole number of at least 1", shown(value))
-        return value
-
     def _head(self, key: str) -> HeadConfig:
         read = self._section(key)
-        where = f"{self._file}: {key}"
-        kind, activation = read["head_type"], read["activation"]
-        if kind not in ("bro", "linear"):
-            raise CheckpointError.at(f"{where}.head_type", "bro or linear", shown(kind))
-        if activation not in ACTIVATIONS:
-            raise CheckpointError.at(f"{where}.activation", f"one of {', '.join(ACTIVATIONS)}", shown(activation))
-        for name, least in (("hidden_dims", 1), ("depth", 0)):
-            if type(read[name]) is not int or read[name] < least:
-                raise CheckpointError.at(f"{where}.{name}", f"a whole number of at least {least}", shown(read[name]))
-        return HeadConfig(kind, read["hidden_dims"], read["depth"], activation)
+        kind: Any = self._one_of(f"{key}.head_type", read["head_type"], ("bro", "linear"))
+        activation = self._one_of(f"{key}.activation", read["activation"], ACTIVATIONS)
+        width, depth = (self._whole(f"{key}.{name}", read[name], n) for name, n in (("hidden_dims", 1), ("depth", 0)))
+        return HeadConfig(kind, width, depth, activation)
 
     def _bins(self, key: str) -> Bins:
         read = self._section(key)
         where = f"{self._file}: {key}"
-        transform, count = read["support_transform"], read["bins"]
-        if transform not in get_args(Transform):
-            expected = f"one of {', '.join(get_args(Transform))}"
-            raise CheckpointError.at(f"{where}.support_transform", expected, shown(transform))
-        if type(count) is not int or count < 1:
-            raise CheckpointError.at(f"{where}.bins", "a whole number of at least 1", shown(count))
+        transform: Any = self._one_of(f"{key}.support_transform", read["support_transform"], get_args(Transform))
+        count = self._whole(f"{key}.bins", read["bins"])
         ends = [read[name] for name in ("min_value", "max_value")]
         if not all(map(_is_number, ends)) or ends[0] > ends[1]:
             raise CheckpointError.at(where, "min_value, and a max_value that is not smaller", shown(ends))
@@ -205,7 +191,6 @@ def _edges(edges: Any, count: int, where: str) -> tuple[float, ...]:
 
 MODEL_TYPE = "rynn_value_lang"
 _EXAMPLE = '--robot-description "a Franka single-arm robot" --camera-description "the main right camera"'
-_BACKBONE_PREFIX = "model."  # prefix of the backbone's weights
 
 
 def reads(folder: Path) -> bool:
@@ -214,9 +199,11 @@ def reads(folder: Path) -> bool:
 
 
 def load(folder: Path, options: CheckpointConfig) -> Loaded:
-    """Load a checkpoint from a local folder. Raises CheckpointError."""
+    """Load a checkpoint from a local folder, with the user's processor and descriptions. Raises CheckpointError."""
     if is_saved(folder):
-        return _exported(folder, options)
+        checkpoint = reopened(RynnCheckpoint, folder, options)
+        changed = _descriptions(options) if checkpoint.config.use_meta else {}
+        return Loaded(replace(checkpoint, config=replace(checkpoint.config, **changed)))
     content = read_json(folder / NETWORK_CONFIG)
     if content.get("model_type") != MODEL_TYPE:
         got = shown(content.get("model_type"))
@@ -233,7 +220,9 @@ def _published(folder: Path, content: dict[str, Any], options: CheckpointConfig)
     backbone = backbone_config({**rest, "model_type": QWEN3}, file)
     tensors, _ = read_published(folder, read_unrounded_config(backbone, file), MODEL_TYPE)
     weights = {name: each for name, each in renamed(tensors, QWEN_NAMES).items() if not UNUSED.fullmatch(name)}
-    _set_rows(backbone, weights, file)
+    if EMBEDDING not in weights:
+        raise CheckpointError.at(folder, f"a weight {EMBEDDING}", "none")
+    backbone["text_config"]["vocab_size"] = len(weights[EMBEDDING])  # its padding may have been kept or cut
     processor = options.base_model or folder
     tokenizer, preprocessor = read_processor(processor)
     fields["value_token"] = read.token("value_token_id", VALUE_TOKEN, tokenizer)
@@ -250,33 +239,9 @@ def _published(folder: Path, content: dict[str, Any], options: CheckpointConfig)
         **{**fields, **limits, **(meta if fields["use_meta"] else {})},
     )
     notes = [f"{name}: not expected, and not used: scores may differ from the original's" for name in read.unexpected]
-    checkpoint = _rounded(RynnCheckpoint(config, weights, processor), options)
-    return Loaded(checkpoint, (*of_dtype, *read.assumptions), lambda: notes)
-
-
-def _exported(folder: Path, options: CheckpointConfig) -> Loaded:
-    """Load an export, with the processor, descriptions and weight format that the user asks for."""
-    checkpoint = RynnCheckpoint.restore(folder)
-    changed = _descriptions(options) if checkpoint.config.use_meta else {}
-    config, processor = replace(checkpoint.config, **changed), options.base_model or checkpoint.processor
-    return Loaded(_rounded(replace(checkpoint, config=config, processor=processor), options))
-
-
-def _rounded(checkpoint: RynnCheckpoint, options: CheckpointConfig) -> RynnCheckpoint:
-    """Return the checkpoint, with the backbone's layers rounded if the user asks for it, and checked."""
-    ours = {name: each for name, each in checkpoint.weights.items() if name.startswith(_BACKBONE_PREFIX)}
-    heads = {name: each for name, each in checkpoint.weights.items() if name not in ours}
-    config, ours, _ = rounded_as_asked(checkpoint.config, ours, {}, options.weights)
-    checkpoint = replace(checkpoint, config=config, weights={**ours, **heads})
+    checkpoint = RynnCheckpoint(config, weights, processor)
     checkpoint.check()
-    return checkpoint
-
-
-def _set_rows(backbone: dict[str, Any], weights: Mapping[str, Tensor], file: Path) -> None:
-    """Take the embedding's row count from the weights: its padding may have been kept or cut."""
-    if EMBEDDING not in weights:
-        raise CheckpointError.at(file.parent, f"a weight {EMBEDDING}", "none")
-    backbone["text_config"]["vocab_size"] = len(weights[EMBEDDING])
+    return Loaded(checkpoint, (*of_dtype, *read.assumptions), lambda _checkpoint: notes)
 
 
 def _descriptions(options: CheckpointConfig) -> dict[str, str]:

@@ -15,6 +15,7 @@ from rfm.files import NETWORK_CONFIG, CheckpointError, network_config, read_json
 from rfm.published.hub import find
 from rfm.published.language import LanguageFolder, reopened
 from rfm.published.reader import Loaded, Reader, asked, settings_asked
+from rfm.published.run_config import check_lerobot
 from rfm.qwen.processor import (
     SIZED_BY_PROCESSOR,
     VIDEO_PREPROCESSOR,
@@ -31,12 +32,8 @@ _TYPE = "topreward"  # value of the key ``type`` in LeRobot's config.json
 FPS = 2.0  # LeRobot's default
 MAX_FRAMES, NUM_PREFIXES = 64, 15  # in Robometer's baseline
 MOST_FRAMES = 512  # default limit in LeRobot's variant: each prefix costs a question
-# Keys in LeRobot's config.json about its own pipelines, uploads and cropping online samples.
-_IDLE = {
-    "attn_implementation", "default_task", "device", "image_key", "input_features", "license", "max_frames",
-    "max_input_length", "normalization_mapping", "output_features", "pretrained_path", "pretrained_revision",
-    "private", "push_to_hub", "repo_id", "success_threshold", "tags", "task_key", "torch_dtype", "type", "vlm_name",
-}  # fmt: skip
+# Keys in LeRobot's config.json without effect here: loading the base model, cropping online samples.
+_IDLE = {"attn_implementation", "max_frames", "max_input_length", "torch_dtype", "vlm_name"}
 _DECIDING = {
     "add_chat_template": "chat_template",
     "fps": "fps",
@@ -67,19 +64,14 @@ def load(folder: Path, options: CheckpointConfig) -> Loaded:
         if name == ROBOMETER:
             raise CheckpointError.at("--as", f"{LEROBOT} for a config.json of LeRobot", name)
         of_lerobot = _lerobot_settings(content, folder / NETWORK_CONFIG)
-        files = _named_by_lerobot(content, options)
+        named = find(options.base_model or str(content.get("vlm_name")))
+        files = LanguageFolder.read(named, replace(options, base_model=None))
     else:
         files = LanguageFolder.read(folder, options)
     config = TopRewardConfig(**files.made_of, **_settings(files, of_lerobot, options))
     checkpoint = TopRewardCheckpoint(config, files.weights, files.processor)
     checkpoint.check()
-    return Loaded(checkpoint, files.assumptions(config))
-
-
-def _named_by_lerobot(content: Mapping[str, Any], options: CheckpointConfig) -> LanguageFolder:
-    """Read the Qwen3-VL that LeRobot's config.json or the caller names."""
-    folder = find(options.base_model or str(content.get("vlm_name")))
-    return LanguageFolder.read(folder, replace(options, base_model=None))
+    return Loaded(checkpoint, files.assumed)
 
 
 def _settings(files: LanguageFolder, of_lerobot: Mapping[str, Any], options: CheckpointConfig) -> dict[str, Any]:
@@ -105,13 +97,8 @@ def _settings(files: LanguageFolder, of_lerobot: Mapping[str, Any], options: Che
 
 
 def _lerobot_settings(content: Mapping[str, Any], file: Path) -> dict[str, Any]:
-    """Return the fields of TopRewardConfig in LeRobot's config.json. Raises CheckpointError for an unknown key."""
-    if unknown := sorted(content.keys() - _IDLE - _DECIDING.keys()):
-        remedy = "if it changes no score, remove it"
-        raise CheckpointError.at(file, "the keys of LeRobot's TOPReward", shown(unknown[0]), remedy)
-    for key in _DECIDING:
-        if content.get(key) is None:
-            raise CheckpointError.at(f"{file}: {key}", "a value", "none", "save the model with LeRobot again")
+    """Return the fields of TopRewardConfig in LeRobot's config.json. Raises CheckpointError as ``check_lerobot``."""
+    check_lerobot(content, file, _DECIDING, _IDLE)
     return {field: content[key] for key, field in _DECIDING.items()}
 
 

@@ -4,16 +4,12 @@
 from __future__ import annotations
 
 import re
-import shlex
 from collections.abc import Iterable, Mapping
-from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rfm.files import (
-    ADAPTER_WEIGHTS,
     NETWORK_CONFIG,
-    SHARDS,
     WEIGHTS,
     WEIGHTS_INDEX,
     CheckpointError,
@@ -25,7 +21,6 @@ from rfm.files import (
     read_json,
     read_tensors,
     shown,
-    tensor_names,
 )
 from rfm.weights import check_names
 
@@ -33,24 +28,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-PICKLE_STEM = "pytorch_model"  # transformers' name for pickled weights
-_ENCODERS = ("image_encoder", "text_encoder")  # subfolders in an exported checkpoint
-_LEVELS = ("*", "*/*", "*/*/*")  # how deep checkpoints lie in a training run's folder or in a model repository
-_MAX_SUGGESTED = 5
-_PICKLES = ("*.bin", "*.pt", "*.pth", "*.ckpt", "*.pkl")
-# Files besides weights from which training resumes.
-_STATES = ("optimizer*", "*optim_states*", "scheduler*", "rng_state*", "random_states*", "scaler*", "training_args*")
-_CONVERT = (
-    "import argparse, functools, sys, torch, safetensors.torch as s; "
-    "torch.serialization.add_safe_globals([argparse.Namespace]); "
-    "load = lambda file: functools.reduce("
-    "lambda d, key: d[key] if isinstance(d.get(key), dict) else d, "
-    "('state_dict', 'model_state_dict', 'model', 'module'), "
-    "torch.load(file, map_location='cpu', weights_only=True)); "
-    "s.save_file({name: t.clone(memory_format=torch.contiguous_format) "
-    "for file in sys.argv[2:] for name, t in load(file).items() if torch.is_tensor(t)}, "
-    "sys.argv[1], {'format': 'pt'})"
-)
+_PICKLES = (".bin", ".pt", ".pth", ".ckpt", ".pkl")
+_STATES = ("optimizer", "scheduler", "rng_state", "random_states", "scaler", "training_args")  # to resume training
 # Prefixes that training code puts before weight names. Those in _INSIDE also stand before layer names.
 _INSIDE = r"_orig_mod|_fsdp_wrapped_module|_checkpoint_wrapped_module|_forward_module"
 _WRAPPERS = re.compile(rf"^(?:(?:module|base_model\.model|{_INSIDE})\.)+|(?<=\.)(?:(?:{_INSIDE})\.)+")
@@ -76,9 +55,10 @@ def read_weights(folder: Path, model_type: str | None = None) -> dict[str, Tenso
     elif is_there(folder / WEIGHTS_INDEX):
         weights = _read_shards(folder / WEIGHTS_INDEX)
     else:
-        refuse_pickles(folder, WEIGHTS, PICKLE_STEM)
+        refuse_pickles(folder, WEIGHTS, [path.name for path in folder.iterdir()])
         got = cut(", ".join(sorted(path.name for path in folder.iterdir()))) or "nothing"
-        raise CheckpointError.at(folder, f"{WEIGHTS} or {WEIGHTS_INDEX}", f"{got}: {_below(folder)}")
+        remedy = "name the folder that has it, beside config.json"
+        raise CheckpointError.at(folder, f"{WEIGHTS} or {WEIGHTS_INDEX}", got, remedy)
     _check_network(folder, weights, model_type)
     return _unwrapped(weights, folder)
 
@@ -102,27 +82,23 @@ def _check_network(folder: Path, names: Iterable[str], model_type: str | None) -
 
 
 def _read_shards(index: Path) -> dict[str, Tensor]:
+    """Return each tensor from the shard that the index names for it."""
     weight_map = read_json(index).get("weight_map")
     if not isinstance(weight_map, dict):
         raise CheckpointError.at(index, "a weight_map", "none")
     weights: dict[str, Tensor] = {}
-    shard_of: dict[str, str] = {}
     for shard in dict.fromkeys(map(str, weight_map.values())):
         if Path(shard).name != shard or not shard.endswith(".safetensors"):
             raise CheckpointError.at(index, "names of files beside it", shown(shard))
         if not is_there(index.parent / shard):
             raise CheckpointError(f"{index}: names the shard {shard}, which is not there")
-        for name, tensor in read_tensors(index.parent / shard).items():
-            if name in shard_of:
-                got = f"{shown(name)} in {shard_of[name]} and in {shard}"
-                raise CheckpointError.at(index, "each tensor in one shard", got, "save the weights again")
-            weights[name], shard_of[name] = tensor, shard
+        tensors = read_tensors(index.parent / shard)
+        if unknown := sorted(tensors.keys() - {name for name, place in weight_map.items() if place == shard}):
+            raise CheckpointError.at(
+                index, f"the tensors in {shard}", f"no {listed(unknown)}", "save the weights again"
+            )
+        weights |= tensors
     check_names(weight_map.keys(), weights.keys())
-    for file in sorted(index.parent.glob(SHARDS)):
-        unknown = set(tensor_names(file)) - shard_of.keys()
-        if unknown:
-            got = f"{file.name}, which it does not name, with {listed(sorted(unknown))}"
-            raise CheckpointError.at(index, "the names of all shards", got, "name a copy of the folder without it")
     return weights
 
 
@@ -147,16 +123,6 @@ def _unwrapped(weights: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]
     return {name.removeprefix(prefix): tensor for name, tensor in bare.items()}
 
 
-def _below(folder: Path) -> str:
-    """Name the checkpoints below a folder that has no weights, or describe a checkpoint's folder."""
-    names = (WEIGHTS, WEIGHTS_INDEX, ADAPTER_WEIGHTS)
-    found = [file.parent for level in _LEVELS for name in names for file in sorted(folder.glob(f"{level}/{name}"))]
-    checkpoints = [str(path) for path in dict.fromkeys(found) if path.name not in _ENCODERS]
-    if not checkpoints:
-        return "a checkpoint's folder has it, beside config.json"
-    return f"name the checkpoint in it: {cut(', '.join(checkpoints[:_MAX_SUGGESTED]))}"
-
-
 def take_prefix(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """Remove the tensors under ``prefix`` from ``weights``; return them without the prefix."""
     names = [name for name in weights if name.startswith(prefix)]
@@ -168,37 +134,13 @@ def has_head(weights: Iterable[str], head: str) -> bool:
     return any(name.startswith(f"{head}_head.") for name in weights)
 
 
-def pickled_weights(names: Iterable[str], stem: str) -> list[str]:
-    """Return the pickles among a folder's file names that may hold weights.
+def refuse_pickles(where: object, wanted: str, names: Iterable[str]) -> None:
+    """Raise CheckpointError if pickled weights are among ``names``, the files beside the missing file ``wanted``.
 
-    stem: how transformers' names begin; if files with such names exist, only these are returned
+    Pickles are never opened, since that may run code.
     """
-    pickles = sorted(name for name in names if _is_any(name, _PICKLES) and not _is_any(name, _STATES))
-    return [name for name in pickles if _is_any(name, (f"{stem}.bin", f"{stem}-*-of-*.bin"))] or pickles
-
-
-def refuse_pickles(folder: Path, wanted: str, stem: str) -> None:
-    """Raise CheckpointError if ``folder`` has pickled weights instead of the missing file ``wanted``.
-
-    Pickles are never opened, since that may run code. The message holds a command that converts them.
-    stem: as in ``pickled_weights``
-    """
-    names = pickled_weights((file.name for file in folder.iterdir()), stem)
-    if not names:
-        return
-    if len(names) > 1 and f"{stem}.bin" in names:
-        both = f"{stem}.bin and {names[0]}"
-        raise CheckpointError.at(folder, "one form of the weights", both, "name a copy without what is not meant")
-    files = names if names[0].endswith(".bin") and "-of-" in names[0] else names[:1]  # all shards, or the first other
-    arguments = shlex.join(map(str, [folder / wanted, *(folder / name for name in files)]))
-    command = f'python -c "{_CONVERT}" {arguments}'
-    got = (
-        f"{cut(', '.join(names))}: pickles may run code when they are loaded, so they are refused. If you trust who "
-        "made it, convert it. weights_only=True lets PyTorch make tensors and little else; do not convert a file that "
-        f"needs more: {command}"
-    )
-    raise CheckpointError.at(folder, wanted, got)
-
-
-def _is_any(name: str, patterns: Iterable[str]) -> bool:
-    return any(fnmatch(name, pattern) for pattern in patterns)
+    pickles = sorted(name for name in names if name.endswith(_PICKLES) and not name.startswith(_STATES))
+    if pickles:
+        got = f"{cut(', '.join(pickles))}: pickles may run code when they are loaded, so they are refused"
+        remedy = "save the weights where they were trained with safetensors.torch.save_file or save_pretrained"
+        raise CheckpointError.at(where, wanted, got, remedy)

@@ -29,7 +29,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from rfm.engine.layers import concatenated
-from rfm.files import CheckpointError
 from rfm.qwen.images import MERGE, Grid
 
 
@@ -125,16 +124,17 @@ def features(visual: Any, patches: Tensor, plan: VisionPlan) -> Tensor:
     visual: transformers' vision tower; only its layers are used
     """
     hidden = embedded(visual.patch_embed.proj, patches)
-    if plan.corners is not None:
-        hidden = hidden + _repeated(_learned_positions(visual.pos_embed, plan), plan.shots)
-    turned = _turned(visual.rotary_pos_emb.inv_freq, plan)
+    if plan.corners is not None and plan.weights is not None:
+        around = visual.pos_embed(plan.corners) * plan.weights.to(visual.pos_embed.weight.dtype)[..., None]
+        hidden = hidden + _repeated(around[0] + around[1] + around[2] + around[3], plan.shots)
+    turn = _turn(visual.rotary_pos_emb.inv_freq, plan)
     if plan.order is not None:
         hidden = _moved(hidden, plan.order)
     full = set(getattr(visual, "fullatt_block_indexes", range(len(visual.blocks))))
     deeper = list(getattr(visual, "deepstack_visual_indexes", ()))
-    of_deeper = {}
+    of_deeper = dict[int, Tensor]()
     for number, block in enumerate(visual.blocks):
-        hidden = hidden + _attention(block.attn, block.norm1(hidden), turned, plan, is_full=number in full)
+        hidden = hidden + _attention(block.attn, block.norm1(hidden), turn, plan, is_full=number in full)
         hidden = hidden + block.mlp(block.norm2(hidden))
         if number in deeper:
             at = deeper.index(number)
@@ -154,10 +154,10 @@ def embedded(projection: Any, patches: Tensor) -> Tensor:
     return F.linear(patches.to(weight.dtype), weight.flatten(1), projection.bias)
 
 
-def _attention(attention: Any, hidden: Tensor, turned: Turn, plan: VisionPlan, *, is_full: bool) -> Tensor:
+def _attention(attention: Any, hidden: Tensor, turn: Tensor, plan: VisionPlan, *, is_full: bool) -> Tensor:
     """Attend within shots (``is_full``) or windows, equal sizes in one call: [N, D] -> [N, D]."""
     heads = attention.qkv(hidden).unflatten(1, (3, attention.num_heads, -1))
-    query, key = turned(heads[:, :2]).unbind(1)
+    query, key = _turned(heads[:, :2], turn).unbind(1)
     value = heads[:, 2]
     is_moved = is_full and plan.order is not None
     if is_moved:
@@ -175,39 +175,25 @@ def _within(run: tuple[int, int], query: Tensor, key: Tensor, value: Tensor, *, 
     return F.scaled_dot_product_attention(query, key, value, scale=scale).transpose(1, 2).flatten(2).flatten(0, 1)
 
 
-@dataclass(frozen=True)
-class Turn:
-    """The rotary embedding: float32 [N, 1, 1, D / heads].
+def _turned(heads: Tensor, turn: Tensor) -> Tensor:
+    """Rotate queries and keys, [N, 2, heads, D / heads], in float32; the result keeps the input dtype."""
+    cosine, sine = turn.unbind(1)
+    first, second = heads.chunk(2, dim=-1)
+    return (heads * cosine + torch.cat((second, first), dim=-1) * sine).to(heads.dtype)
 
-    cosine, sine: by position; the first half of the sines is negated, so queries and keys need no negation
+
+def _turn(frequencies: Tensor, plan: VisionPlan) -> Tensor:
+    """Return the rotary embedding, cosine and sine by patch, float32 [N, 2, 1, 1, D / heads].
+
+    The first half of the sines is negated, so queries and keys need no negation.
     """
-
-    cosine: Tensor
-    sine: Tensor
-
-    def __call__(self, heads: Tensor) -> Tensor:
-        """Rotate queries and keys, [N, 2, heads, D / heads], in float32; the result keeps the input dtype."""
-        first, second = heads.chunk(2, dim=-1)
-        return (heads * self.cosine + torch.cat((second, first), dim=-1) * self.sine).to(heads.dtype)
-
-
-def _turned(frequencies: Tensor, plan: VisionPlan) -> Turn:
     angles = (plan.positions[..., None].to(frequencies.dtype) * frequencies).flatten(1)
     cosine, sine = angles.cos().float(), angles.sin().float()
     of_sizes = torch.stack((torch.cat((cosine, cosine), dim=-1), torch.cat((-sine, sine), dim=-1)), dim=1)
     of_patches = _repeated(of_sizes, plan.shots)
     if plan.order is not None:
         of_patches = _moved(of_patches, plan.order)
-    cosine, sine = of_patches[:, :, None, None].unbind(1)
-    return Turn(cosine, sine)
-
-
-def _learned_positions(embedding: Any, plan: VisionPlan) -> Tensor:
-    """Return interpolated learned positions, [sum of S, D]."""
-    assert plan.corners is not None
-    assert plan.weights is not None
-    around = embedding(plan.corners) * plan.weights.to(embedding.weight.dtype)[..., None]
-    return around[0] + around[1] + around[2] + around[3]
+    return of_patches[:, :, None, None]
 
 
 def _repeated(of_sizes: Tensor, shots: Runs) -> Tensor:
@@ -271,7 +257,6 @@ def _windows(grids: Sequence[Grid], side: int) -> tuple[Runs, Indices]:
     return tuple(runs), np.concatenate(order)
 
 
-FULL_ATTENTION = "full_attention"
 ROOM = 16  # slots that KeyValues adds at a time
 
 
@@ -373,13 +358,6 @@ def run_layers(language: Any, *parts: Part) -> Tensor:
     return language.norm(concatenated([part.states.flatten(0, 1) for part in parts]))
 
 
-def last_hidden_state(
-    language: Any, inputs: dict[str, Tensor], features: Tensor, key_values: KeyValues | None = None
-) -> Tensor:
-    """Return the hidden states behind the final norm, [B, L, D]. ``Part`` describes the parameters."""
-    return run_layers(language, Part(language, inputs, features, key_values)).unflatten(0, inputs["input_ids"].shape)
-
-
 def next_hidden_state(
     language: Any, tokens: Indices, position_ids: Indices, lengths: Indices, key_values: KeyValues
 ) -> Tensor:
@@ -398,10 +376,3 @@ def next_hidden_state(
     key_values.place(before, longest)
     inputs = {"input_ids": ids[:, None], "position_ids": at[None, :, None].expand(3, -1, -1)}
     return run_layers(language, Part(language, inputs, None, key_values, lambda: is_seen))
-
-
-def check_attention(backbone: Any) -> None:
-    """Raise CheckpointError for a language model with layers that do not attend to all earlier tokens."""
-    kinds = set(getattr(backbone.config.get_text_config(), "layer_types", None) or [FULL_ATTENTION])
-    if kinds != {FULL_ATTENTION}:
-        raise CheckpointError.at("text_config.layer_types", f"{FULL_ATTENTION} alone", sorted(kinds))

@@ -11,10 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rfm.engine.device import pinned
 from rfm.engine.layers import changed, concatenated
 from rfm.qwen.backbone import VisionPlan
-from rfm.qwen.images import QwenImages
+from rfm.qwen.images import Grid, QwenImages
 from rfm.qwen.leaves import Leaf, Packs
 from rfm.qwen.video import Indices, Shot, SizedFrames, VlmVideo, shots_of
 
@@ -68,32 +67,35 @@ class VlmRow:
 
 @dataclass(eq=False)
 class SizedShots:
-    """Shots with one size for the vision tower.
+    """Uncached shots with one size for the vision tower.
 
     videos: frames per video, uint8 [N, H', W', 3]
-    firsts: index of a video's first frame among all videos' frames, by the id of its SizedFrames
+    firsts: index of a video's first frame among all videos' frames
     shots: indices of a shot's frames among all videos' frames, by key
     """
 
     videos: list[Tensor] = field(default_factory=list)
-    firsts: dict[int, int] = field(default_factory=dict)
+    firsts: dict[SizedFrames, int] = field(default_factory=dict)
     shots: dict[Hashable, Shot] = field(default_factory=dict)
 
     def add(self, sized: SizedFrames, key: Hashable, shot: Shot) -> None:
         """Add a video's shot."""
-        if id(sized) not in self.firsts:
-            self.firsts[id(sized)] = sum(map(len, self.videos))
+        if sized not in self.firsts:
+            self.firsts[sized] = sum(map(len, self.videos))
             self.videos.append(sized.pixels)
-        first = self.firsts[id(sized)]
         places = [int(sized.places[frame]) for frame in shot]
         assert min(places) >= 0  # the shot is not cached
-        self.shots[key] = tuple(first + place for place in places)
+        self.shots[key] = tuple(self.firsts[sized] + place for place in places)
 
-    def frames(self) -> FramesOfOneSize:
-        """Return the videos and which frames form the shots."""
+    def grid(self, images: QwenImages) -> Grid:
+        """Return the grid in which ``groups`` counts the shots."""
+        return images.grid(len(self.shots), *self.videos[0].shape[1:3])
+
+    def indices(self) -> Tensor | None:
+        """Return the frame indices of S shots, int64 [S, 1] or [S, 2]; None: each frame is an image."""
         shots = torch.tensor(list(self.shots.values()))
         is_each = torch.equal(shots, torch.arange(sum(map(len, self.videos)))[:, None])
-        return FramesOfOneSize(self.videos, None if is_each else shots)
+        return None if is_each else shots
 
 
 class Shots:
@@ -107,7 +109,6 @@ class Shots:
         self._of_size: dict[torch.Size, SizedShots] = {}
         self._kept: dict[Hashable, Tensor] = {}
         self._seen: set[Hashable] = set()
-        self._sized: list[SizedFrames] = []  # references, so that their ids stay unique
 
     @property
     def sizes(self) -> list[SizedShots]:
@@ -117,13 +118,16 @@ class Shots:
     def add(self, video: VlmVideo, shown: Indices) -> list[Hashable]:
         """Add the shots in a conversation that shows these video frames; return their keys."""
         sized, keys = video.ready, []
-        self._sized.append(sized)
         for shot in shots_of(shown, are_images=self._are_images):
             key = sized.keys[shot]
-            if key not in self._seen:
-                self._seen.add(key)
-                self._place(sized, key, shot)
             keys.append(key)
+            if key in self._seen:
+                continue
+            self._seen.add(key)
+            if key in sized.kept:
+                self._kept[key] = sized.kept[key]
+            else:
+                self._of_size.setdefault(sized.pixels.shape[1:3], SizedShots()).add(sized, key, shot)
         return keys
 
     def layout(self, tokens_per_shot: Sequence[int]) -> Layout:
@@ -136,61 +140,36 @@ class Shots:
                 start += tokens
         return Layout(made, self._kept)
 
-    def _place(self, sized: SizedFrames, key: Hashable, shot: Shot) -> None:
-        if key in sized.kept:
-            self._kept[key] = sized.kept[key]
-        else:
-            self._of_size.setdefault(sized.pixels.shape[1:3], SizedShots()).add(sized, key, shot)
-
-
-@dataclass(frozen=True)
-class FramesOfOneSize:
-    """Frames of equal size, by video, and the shots that they form.
-
-    videos: uint8 [T, H', W', 3] each
-    shots: frame indices of S shots, int64 [S, 1] for images, [S, 2] for videos; None: each frame is an image
-    """
-
-    videos: Sequence[Tensor]
-    shots: Tensor | None
-
-    @property
-    def num_shown(self) -> int:
-        """How many frames the shots have; a frame that fills up a pair counts twice."""
-        return sum(map(len, self.videos)) if self.shots is None else self.shots.numel()
-
-    def frames(self, device: torch.device) -> Tensor:
-        """Return the frames of all videos on ``device``, uint8 [sum of T, H', W', 3]."""
-        return concatenated([video.to(device, non_blocking=True) for video in self.videos])
-
 
 @dataclass(frozen=True)
 class QwenPixels:
-    """Pixels for the Qwen backbones: patches from images or frame pairs, in the order of ``sizes``."""
+    """Pixels for the Qwen backbones: patches from images or frame pairs, size by size.
+
+    videos: frames by size and video, uint8 [T, H', W', 3] each
+    shots: as ``SizedShots.indices``, by size
+    """
 
     images: QwenImages
-    sizes: Sequence[FramesOfOneSize]
-
-    @property
-    def videos(self) -> list[Tensor]:
-        """The frames by video, uint8 [T, H', W', 3]."""
-        return [video for size in self.sizes for video in size.videos]
+    videos: Sequence[Sequence[Tensor]]
+    shots: Sequence[Tensor | None]
 
     @property
     def num_shown(self) -> int:
-        """How many frames all shots have."""
-        return sum(size.num_shown for size in self.sizes)
+        """How many frames all shots have; a frame that fills up a pair counts twice."""
+        of_sizes = zip(self.videos, self.shots, strict=True)
+        return sum(sum(map(len, videos)) if shots is None else shots.numel() for videos, shots in of_sizes)
 
     def changed(self, change: Callable[[Tensor], Tensor]) -> QwenPixels:
         """Return these pixels with ``change`` applied to the shots' indices."""
-        shots = [None if size.shots is None else change(size.shots) for size in self.sizes]
-        sizes = [replace(size, shots=made) for size, made in zip(self.sizes, shots, strict=True)]
-        return replace(self, sizes=sizes)
+        return replace(self, shots=[None if shots is None else change(shots) for shots in self.shots])
 
     def inputs(self, device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
         """Return the backbone's input: the patches of all shots on ``device``."""
-        patches = [self.images.patches(size.frames(device), size.shots, dtype) for size in self.sizes]
-        return {"pixel_values": concatenated(patches)}
+        patches = []
+        for videos, shots in zip(self.videos, self.shots, strict=True):
+            frames = concatenated([video.to(device, non_blocking=True) for video in videos])
+            patches.append(self.images.patches(frames, shots, dtype))
+        return {"pixel_values": concatenated(patches)} if patches else {}
 
 
 class Layout:
@@ -219,27 +198,27 @@ class Layout:
 class VlmBatch:
     """Conversations, padded to the longest, with F frames (or temporal patches) and Q queries.
 
+    Spans and queries are indices among all tokens: the conversations' B * L, then those in the packs.
+
     inputs: the backbone's arguments by name
-    spans: int64 [F, 3], per frame the row, the first token and the token behind the last whose states are read
-    query_rows, query_tokens: int64 [Q], row and token of the queries
+    spans: int64 [F, 2], per frame the first token and the token behind the last whose states are read
+    queries: int64 [Q], the queries' tokens
     num_tokens, num_span_tokens: tokens without padding; tokens in all spans
-    pixels: source of the pixel arguments; None: these are in ``inputs``, or all shots are cached
+    pixels: source of the pixel arguments; None: these are in ``inputs``
     plan: for the vision tower; None: all shots are cached
-    layout: where the shots' tokens lie; None: not placed yet
-    packs: conversations that begin like others (``rfm.qwen.tree``). With packs, spans and queries have row 0 and
-        index all tokens: the conversations' B * L, then those in the packs
+    layout: where the shots' tokens lie
+    packs: conversations that begin like others (``rfm.qwen.tree``)
     """
 
     inputs: dict[str, Tensor]
     spans: Tensor
-    query_rows: Tensor
-    query_tokens: Tensor
+    queries: Tensor
     num_tokens: int
     num_span_tokens: int
-    pixels: QwenPixels | None = None
-    plan: VisionPlan | None = None
-    layout: Layout | None = None
-    packs: tuple[Packs, ...] = ()
+    pixels: QwenPixels | None
+    plan: VisionPlan | None
+    layout: Layout
+    packs: tuple[Packs, ...]
 
     @property
     def num_slots(self) -> int:
@@ -247,8 +226,8 @@ class VlmBatch:
         return sum(ids.numel() for ids in (self.inputs["input_ids"], *(packs.input_ids for packs in self.packs)))
 
     def pinned(self) -> VlmBatch:
-        """Return the batch with all tensors except the frames in pinned memory."""
-        return self._changed(pinned)
+        """Return the batch with all tensors except the frames in pinned memory, from which a GPU copies meanwhile."""
+        return self._changed(Tensor.pin_memory)
 
     def to(self, device: torch.device, dtype: torch.dtype) -> VlmBatch:
         """Return the batch on ``device``, where pixels are normalised, cut into patches and converted to ``dtype``."""
@@ -258,11 +237,8 @@ class VlmBatch:
 
     def _changed(self, change: Callable[[Tensor], Tensor]) -> VlmBatch:
         return replace(
-            self,
+            changed(self, change),
             inputs={name: change(tensor) for name, tensor in self.inputs.items()},
-            spans=change(self.spans),
-            query_rows=change(self.query_rows),
-            query_tokens=change(self.query_tokens),
             pixels=None if self.pixels is None else self.pixels.changed(change),
             plan=None if self.plan is None else changed(self.plan, change),
             packs=tuple(changed(packs, change) for packs in self.packs),

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from rfm.engine.family import NETWORK, config_fields
 from rfm.engine.feature_cache import FeatureCache
-from rfm.files import NETWORK_CONFIG, CheckpointError, expecting, shown
+from rfm.files import NETWORK_CONFIG, expecting
 from rfm.qwen.collator import QwenCollator
 from rfm.qwen.lora import merged
 from rfm.qwen.network import build_backbone
@@ -31,8 +31,6 @@ _EMBEDDING = "embed_tokens."  # looked up, not multiplied
 
 
 LORA = "lora"  # key in ``parts``: the factors that change the network's weights
-MAX_LAYERS = 1024
-_LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,6 @@ class QwenCheckpoint:
         return self.load_collator()
 
     def load_collator(self) -> QwenCollator:
-        """Return the sample collator. Raises CheckpointError if the processor is missing or does not fit."""
         raise NotImplementedError
 
     def network(self, dtype: torch.dtype) -> nn.Module:
@@ -71,7 +68,6 @@ class QwenCheckpoint:
         return network
 
     def skeleton(self) -> nn.Module:
-        """Return the network without weights."""
         with torch.device("meta"):
             return self.network(self.config.torch_dtype)
 
@@ -136,18 +132,7 @@ class QwenCheckpoint:
 
     def check(self) -> None:
         """Raise CheckpointError unless the weights fit the network, before memory is allocated for it."""
-        _check_layers(self.config.backbone)
         with expecting("a backbone that transformers can make", NETWORK_CONFIG):
             network = self.skeleton()
         fit(network, self.weights)
         check_shapes(network.state_dict(), self.loaded(self.weights))
-
-
-def _check_layers(config: Any) -> None:
-    inner = config.values() if isinstance(config, dict) else config if isinstance(config, list) else ()
-    for part in inner:
-        _check_layers(part)
-    for name in _LAYER_COUNTS if isinstance(config, dict) else ():
-        count = config.get(name)
-        if isinstance(count, (int, float)) and count > MAX_LAYERS:
-            raise CheckpointError.at(f"{NETWORK_CONFIG}: {name}", f"at most {MAX_LAYERS}", shown(count))

@@ -19,11 +19,12 @@ from torch import Tensor
 
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.layers import concatenated
+from rfm.engine.predictor import prefix_indices
 from rfm.engine.threads import IN_TURN, FrameThreads
 from rfm.qwen.backbone import Box, plan, positions
 from rfm.qwen.batch import QwenPixels, Shots, VlmBatch, VlmRow
 from rfm.qwen.images import FRAMES_PER_GROUP, MERGE, Grid, QwenImages
-from rfm.qwen.leaves import Leaf, PlacedPack, calls, padded, starts
+from rfm.qwen.leaves import Leaf, Packs, PlacedPack, calls, padded
 from rfm.qwen.network import QWEN3, WRAPPED
 from rfm.qwen.video import Indices, Shot, SizedFrames, VlmVideo
 from rfm_client.contract import InvalidSampleError, Sample, Trajectory
@@ -43,10 +44,10 @@ class Visual(Enum):
 class Chat:
     """A base model's chat template and tokenizer, with a cache of recent short conversations."""
 
-    def __init__(self, tokenizer: Any) -> None:
+    def __init__(self, tokenizer: Any, kept_tokens: int = KEPT_TEXTS) -> None:
         self._tokenizer = tokenizer
         self._text = lru_cache(KEPT_TEXTS)(self._render)
-        self._tokens = lru_cache(KEPT_TEXTS)(self._tokenise)
+        self._tokens = lru_cache(kept_tokens)(self._tokenise)
 
     def text(self, parts: tuple[str | Visual, ...]) -> str:
         """Return the chat template's text for one user message."""
@@ -89,13 +90,14 @@ class QwenCollator:
     """
 
     makes_trees: ClassVar[bool] = True  # compute the shared beginnings of prefixes once
+    kept_tokens: ClassVar[int] = KEPT_TEXTS  # texts whose tokens are cached: whole conversations
 
     def __init__(self, config: Any, tokenizer: Any, images: QwenImages) -> None:
         self.config = config
         self.tokenizer = tokenizer
         self.images = images
         self._special_tokens = tuple(tokenizer.get_added_vocab())
-        self._chat = Chat(tokenizer)
+        self._chat = Chat(tokenizer, self.kept_tokens)
 
     @property
     def frames_per_shot(self) -> int:
@@ -112,27 +114,58 @@ class QwenCollator:
         length: L, the padded length; None: the longest conversation's
         """
         length = length or max(row.num_tokens for row in rows)
-        pad = self.tokenizer.pad_token_id
-        ids = torch.full((len(rows), length), pad, dtype=torch.int64)
+        ids = torch.full((len(rows), length), self.tokenizer.pad_token_id, dtype=torch.int64)
+        position_ids = torch.zeros(3, *ids.shape, dtype=torch.int64)
         for index, row in enumerate(rows):
             ids[index, : row.num_tokens] = torch.from_numpy(row.input_ids)
-        spans = [
-            (index, start, stop)
-            for index, row in enumerate(rows)
-            for of_trajectory in row.spans
-            for start, stop in of_trajectory
-        ]
-        queries = [(index, row.query) for index, row in enumerate(rows) if row.query is not None]
-        query_rows, query_tokens = torch.tensor(queries, dtype=torch.int64).reshape(-1, 2).T.contiguous()
-        batch = VlmBatch(
-            inputs={"input_ids": ids},
-            spans=torch.tensor(spans, dtype=torch.int64),
-            query_rows=query_rows,
-            query_tokens=query_tokens,
+            position_ids[:, index, : row.num_tokens] = torch.from_numpy(row.position_ids)
+        shots = Shots(are_images=self.config.multi_image)
+        read = [shots.add(video, shown) for row in rows for video, shown in row.shown]
+        read_by = {leaf: shots.add(row.videos[0], leaf.shown) for row in rows for leaf in row.leaves}
+        grids = [each.grid(self.images) for each in shots.sizes]
+        layout = shots.layout([grid.tokens_per_group for grid in grids])
+        packs, first = self._packs(rows, ids.numel(), lambda leaf: layout.tokens(read_by[leaf]))
+        spans, queries = list[tuple[int, int]](), list[int]()
+        for index, row in enumerate(rows):
+            reads = [(first[leaf] + leaf.reads[0], first[leaf] + leaf.reads[1]) for leaf in row.leaves]
+            own = [(index * length + start, index * length + stop) for each in row.spans for start, stop in each]
+            spans += own if row.query is not None else [*reads, *own]
+            queries += [] if row.query is None else [*(start for start, _ in reads), index * length + row.query]
+        return VlmBatch(
+            inputs={
+                "input_ids": ids,
+                "position_ids": position_ids,
+                "visual_tokens": (ids.flatten() == self.visual_pad).nonzero()[:, 0],
+                "visual_features": torch.from_numpy(np.concatenate([layout.tokens(keys) for keys in read])),
+            },
+            spans=torch.tensor(spans, dtype=torch.int64).reshape(-1, 2),
+            queries=torch.tensor(queries, dtype=torch.int64),
             num_tokens=sum(row.cost for row in rows),
-            num_span_tokens=sum(stop - start for _, start, stop in spans),
+            num_span_tokens=sum(stop - start for start, stop in spans),
+            pixels=QwenPixels(
+                self.images, [each.videos for each in shots.sizes], [each.indices() for each in shots.sizes]
+            ),
+            plan=plan(grids, self.config.backbone["vision_config"]) if grids else None,
+            layout=layout,
+            packs=packs,
         )
-        return self._with_pixels(batch, rows)
+
+    def _packs(
+        self, rows: Sequence[VlmRow], num_slots: int, features: Callable[[Leaf], Indices]
+    ) -> tuple[tuple[Packs, ...], dict[Leaf, int]]:
+        """Return the packs of all rows, call by call, and each leaf's first token among all tokens in the batch.
+
+        num_slots: B * L
+        features: returns the feature indices that a leaf's whole conversation shows
+        """
+        packs = [PlacedPack(index, row.num_tokens, pack) for index, row in enumerate(rows) for pack in row.packs]
+        made, first = [], dict[Leaf, int]()
+        for call in calls(packs):
+            of_call, starts = padded(call, self.tokenizer.pad_token_id, self.visual_pad, features)
+            made.append(of_call)
+            first |= {leaf: num_slots + start for leaf, start in starts.items()}
+            num_slots += of_call.input_ids.numel()
+        return tuple(made), first
 
     def _positions(self, ids: Indices, token: str) -> Indices:
         return np.flatnonzero(ids == self.tokenizer.convert_tokens_to_ids(token))
@@ -218,68 +251,21 @@ class QwenCollator:
                 read += boxes[-1].num_tokens
         return positions(len(ids), boxes)
 
-    def _with_pixels(self, batch: VlmBatch, rows: Sequence[VlmRow]) -> VlmBatch:
-        """Return the batch with the backbone's inputs besides tokens."""
-        shots = Shots(are_images=self.config.multi_image)
-        read = [shots.add(video, shown) for row in rows for video, shown in row.shown]
-        read_by = {leaf: shots.add(row.videos[0], leaf.shown) for row in rows for leaf in row.leaves}
-        grids = [self.images.grid(len(each.shots), *each.videos[0].shape[1:3]) for each in shots.sizes]
-        layout = shots.layout([grid.tokens_per_group for grid in grids])
-        ids = batch.inputs["input_ids"]
-        position_ids = torch.zeros(3, *ids.shape, dtype=torch.int64)
-        for index, row in enumerate(rows):
-            position_ids[:, index, : row.num_tokens] = torch.from_numpy(row.position_ids)
-        inputs = {
-            "input_ids": ids,
-            "position_ids": position_ids,
-            "visual_tokens": (ids.flatten() == self.visual_pad).nonzero()[:, 0],
-            "visual_features": torch.from_numpy(np.concatenate([layout.tokens(keys) for keys in read])),
-        }
-        batch = replace(batch, inputs=inputs, layout=layout)
-        if read_by:
-            batch = self._with_leaves(batch, rows, lambda leaf: layout.tokens(read_by[leaf]))
-        if not grids:
-            return batch
-        pixels = QwenPixels(self.images, [each.frames() for each in shots.sizes])
-        return replace(batch, pixels=pixels, plan=plan(grids, self.config.backbone["vision_config"]))
-
-    def _with_leaves(self, batch: VlmBatch, rows: Sequence[VlmRow], features: Callable[[Leaf], Indices]) -> VlmBatch:
-        """Return the batch with all leaves, and with its spans and queries as indices among all tokens.
-
-        features: returns the feature indices that a leaf's whole conversation shows
-        """
-        packs = [PlacedPack(index, row.num_tokens, pack) for index, row in enumerate(rows) for pack in row.packs]
-        made, first = [], dict[Leaf, int]()
-        num_slots = batch.inputs["input_ids"].numel()
-        for call in calls(packs):
-            made.append(padded(call, self.tokenizer.pad_token_id, self.visual_pad, features))
-            first |= {leaf: num_slots + start for leaf, start in starts(call).items()}
-            num_slots += made[-1].input_ids.numel()
-        length = batch.inputs["input_ids"].shape[1]
-        spans, queries = [], []
-        for index, row in enumerate(rows):
-            reads = [(first[leaf] + leaf.reads[0], first[leaf] + leaf.reads[1]) for leaf in row.leaves]
-            own = [(index * length + start, index * length + stop) for each in row.spans for start, stop in each]
-            spans += own if row.query is not None else [*reads, *own]
-            queries += [] if row.query is None else [*(start for start, _ in reads), index * length + row.query]
-        return replace(
-            batch,
-            packs=tuple(made),
-            spans=torch.tensor([(0, *span) for span in spans], dtype=torch.int64).reshape(-1, 3),
-            num_span_tokens=sum(stop - start for start, stop in spans),
-            query_rows=torch.zeros(len(queries), dtype=torch.int64),
-            query_tokens=torch.tensor(queries, dtype=torch.int64),
-        )
-
 
 def video_of(trajectory: Trajectory, frame_steps: int) -> VlmVideo:
-    """Return a trajectory's frames as a video. Raises InvalidSampleError for embeddings."""
+    """Return a trajectory's frames as a video. Raises InvalidSampleError for embeddings.
+
+    frame_steps: for dense mode; 0: one conversation with all frames
+    """
+    frames: Any = trajectory.frames
+    digests = None
     if trajectory.named is not None:
         digests, frames = zip(*trajectory.named, strict=True)
-        return VlmVideo.of(frames, frame_steps, digests)
-    if trajectory.frames is None:
+    if frames is None:
         raise InvalidSampleError.at("video_embeddings", "frames (this checkpoint reads raw frames)", "embeddings")
-    return VlmVideo.of(trajectory.frames, frame_steps)
+    count = len(frames)
+    conversations = list(prefix_indices(count, frame_steps)) if frame_steps else [np.arange(count)]
+    return VlmVideo(frames, frame_steps or count, conversations, digests)
 
 
 def expanded(ids: Indices, pad: int, lengths: Sequence[int]) -> Indices:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -24,7 +23,7 @@ from rfm.qwen.backbone import Box, KeyValues, positions
 from rfm.qwen.batch import VlmBatch, VlmRow
 from rfm.qwen.checkpoint import QwenCheckpoint
 from rfm.qwen.collator import VIDEO_PAD, VISION_END, VISION_START, QwenCollator, expanded, timed_groups, video_of
-from rfm.qwen.images import MERGE, QwenImages
+from rfm.qwen.images import MERGE, BoundedImages, QwenImages
 from rfm.qwen.network import BackboneConfig, qwen_states
 from rfm.qwen.processor import (
     SIZED_BY_PROCESSOR,
@@ -36,6 +35,7 @@ from rfm.qwen.processor import (
 from rfm.qwen.video import Indices, VlmVideo
 from rfm.saved import REWARD_MODEL, Saved
 from rfm_client.contract import ProgressSample, Sample
+from rfm_client.contract.description import Description
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
 VIDEO = VISION_START + VIDEO_PAD + VISION_END  # a video, or a temporal patch, in a prompt's text
 HEAD, EMBEDDING = "lm_head.weight", "model.language_model.embed_tokens.weight"
-MOST_PIECES = 4096  # cached prompt and time texts
 
 
 @dataclass(frozen=True)
@@ -103,15 +102,13 @@ class LanguageNetwork(nn.Module):
         key_values: receives the keys and values of all tokens
         """
         hidden, made = qwen_states(self.model, batch, key_values, self.graphs)
-        return LanguageOutput(self.lm_head(hidden[batch.query_rows, batch.query_tokens]), made)
+        return LanguageOutput(self.lm_head(hidden[batch.queries]), made)
 
 
 class LanguageCollator(QwenCollator):
     """The collator for prompts with one video, every temporal patch behind its time."""
 
-    def __init__(self, config: Any, tokenizer: Any, images: QwenImages) -> None:
-        super().__init__(config, tokenizer, images)
-        self._piece = lru_cache(MOST_PIECES)(self._chat.tokens)
+    kept_tokens = 4096  # pieces of prompts, and times
 
     def check_template(self) -> None:
         """Raise CheckpointError unless a prompt has its video once."""
@@ -149,7 +146,7 @@ class LanguageCollator(QwenCollator):
         first, *others = self._around(*(timed_groups([time_s]) for time_s in times_s))
         # All pieces but the last end with a special token, so tokenising them separately gives the text's own tokens.
         pieces = [before + first, *others, behind]
-        tokens = np.concatenate([*map(self._piece, pieces), more]).astype(np.int64)
+        tokens = np.concatenate([*map(self._chat.tokens, pieces), more]).astype(np.int64)
         pad = self.tokenizer.convert_tokens_to_ids(VIDEO_PAD)
         ids = expanded(tokens, pad, [grid.tokens_per_group] * len(times_s))
         starts = self._positions(ids, VISION_START) + 1
@@ -172,10 +169,11 @@ class LanguageCheckpoint(QwenCheckpoint):
     """A Qwen3-VL in memory that is prompted in words.
 
     weights: for LanguageNetwork; with the head only if it is not tied to the embedding
-    made_of: the configuration class
+    made_of, collator_of: the classes of the configuration and the collator
     """
 
     made_of: ClassVar[type[LanguageConfig]]
+    collator_of: ClassVar[Any]
     network_of: ClassVar[Any] = LanguageNetwork
     reads_videos: ClassVar[bool] = True  # otherwise separate images
     has_language_head: ClassVar[bool] = True
@@ -194,7 +192,6 @@ class LanguageCheckpoint(QwenCheckpoint):
         return checkpoint
 
     def load_collator(self) -> LanguageCollator:
-        """Return the sample collator. Raises CheckpointError if the processor is missing or does not fit."""
         tokenizer, preprocessor = read_processor(self.processor, videos=self.reads_videos)
         num_rows = self.config.backbone["text_config"]["vocab_size"]
         if len(tokenizer) > num_rows:
@@ -216,7 +213,6 @@ class LanguageCheckpoint(QwenCheckpoint):
         return {**weights, **({HEAD: weights[EMBEDDING]} if is_tied else {})}
 
     def saved_settings(self) -> dict[str, Any]:
-        """Return this project's fields for an exported config.json."""
         return {REWARD_MODEL: self.config.reward_model, **super().saved_settings()}
 
     def build(self, dtype: torch.dtype | None = None) -> Any:
@@ -226,6 +222,15 @@ class LanguageCheckpoint(QwenCheckpoint):
             network.lm_head.weight = network.model.language_model.embed_tokens.weight
         return network
 
-    def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> LanguageCollator:
+    def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> Any:
         """Return the collator with this tokenizer and preprocessing."""
-        raise NotImplementedError
+        return self.collator_of(self.config, tokenizer, self.images(patch_px, normalisation))
+
+    def images(self, patch_px: int, normalisation: Normalisation) -> QwenImages:
+        """Return the preprocessing; by default that of separate images whose pixels the configuration bounds."""
+        return BoundedImages(patch_px, normalisation, least_px=self.config.least_px, most_px=self.config.most_px)
+
+    def described(self, kind: str, **facts: Any) -> Description:
+        """Return the description of a model of this kind. facts: what not all such models have in common"""
+        network = {"class": self.network_of.__name__}
+        return Description(kind=kind, network=network, asks_in_words=True, keeps_features=True, is_large=True, **facts)

@@ -123,8 +123,10 @@ def calls(packs: Sequence[PlacedPack]) -> Iterator[list[PlacedPack]]:
         yield part
 
 
-def padded(packs: Sequence[PlacedPack], pad: int, visual_pad: int, features: Callable[[Leaf], Indices]) -> Packs:
-    """Return the packs for one call.
+def padded(
+    packs: Sequence[PlacedPack], pad: int, visual_pad: int, features: Callable[[Leaf], Indices]
+) -> tuple[Packs, dict[Leaf, int]]:
+    """Return the packs for one call, and the index of each leaf's first token among the call's R * P tokens.
 
     pad, visual_pad: the padding token, the vision token
     features: returns the feature indices that a whole conversation shows, int64
@@ -135,11 +137,12 @@ def padded(packs: Sequence[PlacedPack], pad: int, visual_pad: int, features: Cal
     ids, leaves, places = np.full(shape, pad), np.full(shape, -1), np.zeros(shape, np.int64)
     positions, from_trunk = np.zeros((3, *shape), np.int64), np.ones(shape, np.int64)  # padding sees one token
     seen, upto = np.zeros((levels, *shape), np.int64), np.zeros((levels, *shape), np.int64)
-    of_features = []
+    of_features, starts = [], dict[Leaf, int]()
     for row, pack in enumerate(packs):
         start = 0
         for index, leaf in enumerate(pack.leaves):
             at = (row, slice(start, start + leaf.num_tokens))
+            starts[leaf] = row * longest + start
             start += leaf.num_tokens
             ids[at], leaves[at], from_trunk[at] = leaf.input_ids, index, leaf.from_trunk
             positions[:, at[0], at[1]] = leaf.position_ids
@@ -153,16 +156,4 @@ def padded(packs: Sequence[PlacedPack], pad: int, visual_pad: int, features: Cal
     at_features = np.flatnonzero(ids == visual_pad)
     arrays = ids, positions, at_features, np.concatenate(of_features), from_trunk, leaves, places, seen, upto
     trunks = torch.tensor([pack.trunk for pack in packs])
-    return Packs(trunks, max(pack.num_keys for pack in packs), *map(torch.from_numpy, arrays))
-
-
-def starts(packs: Sequence[PlacedPack]) -> dict[Leaf, int]:
-    """Return the index of each leaf's first token among a call's R * P tokens."""
-    longest = max(pack.num_tokens for pack in packs)
-    found = {}
-    for row, pack in enumerate(packs):
-        start = row * longest
-        for leaf in pack.leaves:
-            found[leaf] = start
-            start += leaf.num_tokens
-    return found
+    return Packs(trunks, max(pack.num_keys for pack in packs), *map(torch.from_numpy, arrays)), starts

@@ -21,24 +21,26 @@ from torch import Tensor, nn
 from rfm.config import VideoPrompt, Weights
 from rfm.engine.graphs import Graphs
 from rfm.engine.layers import changed, concatenated
+from rfm.files import CheckpointError
 from rfm.qwen.backbone import (
     UNIT,
     KeyValues,
     Part,
     VisionPlan,
-    check_attention,
     features,
-    last_hidden_state,
     run_layers,
 )
 from rfm.qwen.batch import VlmBatch
 from rfm.qwen.leaves import Packs
+from rfm_client.contract.checks import require
 
 QWEN_2_5 = "qwen2_5_vl"
 BACKBONES = {QWEN_2_5: "Qwen2_5_VLModel", "qwen3_vl": "Qwen3VLModel"}
 QWEN3 = "qwen3_vl"
 BARE: Final = "bare"
 WRAPPED: Final = "wrapped"
+FULL_ATTENTION = "full_attention"
+MAX_LAYERS = 1024  # more would be made for hours, and no model has them
 Dtype: TypeAlias = Literal["float32", "bfloat16", "float16"]
 
 
@@ -78,7 +80,7 @@ def qwen_states(
 ) -> tuple[Tensor, Tensor | None]:
     """Return a Qwen backbone's last hidden states, and the features that its vision tower computed.
 
-    The states have the shape [B, L, D], or [1, all tokens, D] for a batch with packs.
+    The states have the shape [all tokens, D]: the conversations' B * L, then those in the packs.
 
     key_values: receives the keys and values of all tokens, for ``next_hidden_state``
     graphs: for small batches; the language model uses none if ``key_values`` is given
@@ -87,27 +89,35 @@ def qwen_states(
     if batch.plan is not None:
         of_tower = backbone.visual, batch.inputs["pixel_values"], batch.plan
         made = features(*of_tower) if graphs is None else graphed_features(graphs, *of_tower)
-    assert batch.layout is not None
     shots = [*([] if made is None else [made]), *batch.layout.kept.values()]
     merged = concatenated(shots)
     if batch.packs:
         return tree_hidden_states(backbone.language_model, batch.inputs, batch.packs, merged), made
     if graphs is not None and key_values is None:
         return graphed_hidden_state(graphs, backbone.language_model, batch.inputs, merged), made
-    return last_hidden_state(backbone.language_model, batch.inputs, merged, key_values), made
+    trunks = Part(backbone.language_model, batch.inputs, merged, key_values)
+    return run_layers(backbone.language_model, trunks), made
 
 
 def build_backbone(config: BackboneConfig, dtype: torch.dtype) -> nn.Module:
-    """Return the backbone with uninitialised weights in ``dtype``; buffers keep their own dtype."""
+    """Return the backbone with uninitialised weights in ``dtype``; buffers keep their own dtype.
+
+    Raises CheckpointError for a language model with other layers than full attention, and for thousands of layers.
+    """
     try:
         import transformers
     except ImportError as error:
         raise ImportError('vision-language checkpoints need transformers: pip install ".[vlm]"') from error
     network = getattr(transformers, BACKBONES[config.family])
+    for part, name in (("text_config", "num_hidden_layers"), ("vision_config", "depth")):
+        count = config.backbone[part].get(name, 0)
+        require(f"{part}.{name}", count <= MAX_LAYERS, f"at most {MAX_LAYERS}", count, CheckpointError)
     settings = network.config_class.from_dict(config.backbone)
     with _no_init_weights():
         backbone: nn.Module = network._from_config(settings, dtype=dtype, attn_implementation="sdpa")
-    check_attention(backbone)
+    kinds = set(getattr(settings.get_text_config(), "layer_types", None) or [FULL_ATTENTION])
+    if kinds != {FULL_ATTENTION}:  # other layers do not attend to all earlier tokens
+        raise CheckpointError.at("text_config.layer_types", f"{FULL_ATTENTION} alone", sorted(kinds))
     return backbone
 
 
@@ -135,10 +145,11 @@ def graphed_features(graphs: Graphs, visual: Any, patches: Tensor, plan: VisionP
 
 
 def graphed_hidden_state(graphs: Graphs, language: Any, inputs: dict[str, Tensor], features: Tensor) -> Tensor:
-    """Return ``rfm.qwen.backbone.last_hidden_state``, computed by a CUDA graph if the shapes recur."""
+    """Return the hidden states behind the final norm, computed by a CUDA graph if the shapes recur."""
 
     def hidden_state(features: Tensor, *of_batch: Tensor) -> Tensor:
-        return last_hidden_state(language, dict(zip(LANGUAGE_INPUTS, of_batch, strict=True)), features)
+        inputs = dict(zip(LANGUAGE_INPUTS, of_batch, strict=True))
+        return run_layers(language, Part(language, inputs, features))
 
     tensors = [features, *(inputs[name] for name in LANGUAGE_INPUTS)]
     return graphs(hidden_state, tensors, "language", inputs["input_ids"].numel())
@@ -169,7 +180,7 @@ class PackKeyValues:
 
 
 def tree_hidden_states(language: Any, inputs: dict[str, Tensor], packs: Sequence[Packs], features: Tensor) -> Tensor:
-    """Return the hidden states behind the final norm, trunks first, then call by call, [1, all tokens, D].
+    """Return the hidden states behind the final norm, trunks first, then call by call, [all tokens, D].
 
     language, inputs, features: the trunks' arguments for ``rfm.qwen.backbone.Part``
     """
@@ -179,4 +190,4 @@ def tree_hidden_states(language: Any, inputs: dict[str, Tensor], packs: Sequence
         Part(language, each.inputs, features, PackKeyValues(trunks, each), cache(each.mask) if is_kept else each.mask)
         for each in packs
     ]
-    return run_layers(language, Part(language, inputs, features, trunks), *calls)[None]
+    return run_layers(language, Part(language, inputs, features, trunks), *calls)

@@ -15,15 +15,15 @@ from rfm.engine.execution import Execution
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.graphs import Graphs
 from rfm.engine.layers import speed_up
-from rfm.engine.predictor import RowScores, of_rows
+from rfm.engine.predictor import Predictor, RowScores
 from rfm.engine.threads import FrameThreads
 from rfm.qwen.batch import Layout, VlmBatch, VlmRow
 from rfm.qwen.collator import QwenCollator
 from rfm.qwen.tree import trees
-from rfm_client.contract import FrameScores, InvalidSampleError, RewardError, Sample
+from rfm_client.contract import InvalidSampleError, RewardError, Sample
 
 
-class QwenPredictor:
+class QwenPredictor(Predictor[VlmRow, VlmBatch]):
     """A reward model on a Qwen backbone, on a device. A family implements ``score``.
 
     cache: holds frames, which requests may name, and temporal patch features; None: no cache
@@ -31,8 +31,6 @@ class QwenPredictor:
     """
 
     works_ahead = True
-    has_progress = True
-    reads_views = False
 
     def __init__(
         self, network: Any, collator: QwenCollator, device: torch.device, cache: FeatureCache[Any] | None = None
@@ -49,7 +47,6 @@ class QwenPredictor:
 
     @property
     def has_success(self) -> bool:
-        """True if the network predicts success."""
         return bool(self.network.config.has_success)
 
     def use_graphs(self, graphs: Graphs) -> None:
@@ -69,11 +66,9 @@ class QwenPredictor:
         return trees(rows, self.collator.visual_pad, are_images=self.collator.config.multi_image)
 
     def num_tokens(self, row: VlmRow) -> int:
-        """Return how many tokens the language model computes."""
         return row.cost
 
     def sequences(self, row: VlmRow) -> Sequence[VlmRow]:
-        """Return the conversations in the row."""
         return row.alone or (row,)
 
     def work_ahead(self, rows: Sequence[VlmRow]) -> None:
@@ -84,7 +79,6 @@ class QwenPredictor:
                 video.sized = replace(sized, pixels=self._copies.send(sized.pixels))
 
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
-        """Return one batch with conversations of any kind."""
         self.work_ahead(rows)
         graphs = self.network.graphs
         length = None if graphs is None else graphs.padded(len(rows), max(row.num_tokens for row in rows))
@@ -95,20 +89,15 @@ class QwenPredictor:
         """Count tokens, without and with padding, encoded frames, and frames with cached features."""
         execution.add_tokens(batch.num_tokens, batch.num_slots)
         execution.num_encoded += 0 if batch.pixels is None else batch.pixels.num_shown
-        execution.num_found += 0 if batch.layout is None else len(batch.layout.kept) * self.collator.frames_per_shot
+        execution.num_found += len(batch.layout.kept) * self.collator.frames_per_shot
         execution.cache_bytes = None if self.cache is None else self.cache.num_bytes
 
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch, execution: Execution) -> list[RowScores | RewardError]:
-        """Run one forward pass; return each row's scores or error."""
         raise NotImplementedError
-
-    def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
-        """Return frame scores for a progress sample, joined from all its rows."""
-        return of_rows(sample, rows)
 
     def _output(self, batch: VlmBatch, *arguments: Any) -> Any:
         """Return the network's output. Out of memory, free caches and graphs: the engine retries with fewer rows."""
-        self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
+        self._copies.wait_for([video for videos in batch.pixels.videos for video in videos] if batch.pixels else [])
         try:
             with memory_errors():
                 return self.network(batch.to(self.device, self._dtype), *arguments)
@@ -119,25 +108,18 @@ class QwenPredictor:
                 self.network.graphs.clear()
             raise
 
-    def _keep(self, rows: Sequence[VlmRow], layout: Layout | None, made: torch.Tensor | None) -> None:
-        """Cache the videos' frames and new features; skip videos larger than the cache.
-
-        layout: where the shots' tokens lie; None: nothing can be cached
-        """
-        if self.cache is None or layout is None:
+    def _keep(self, rows: Sequence[VlmRow], layout: Layout, made: torch.Tensor | None) -> None:
+        """Cache the videos' frames and new features; skip videos larger than the cache."""
+        cache = self.cache
+        if cache is None:
             return
         with suppress(torch.OutOfMemoryError), memory_errors():  # the scores are complete without the cache
-            self._keep_all(self.cache, rows, layout, made)
-
-    @staticmethod
-    def _keep_all(cache: FeatureCache[Any], rows: Sequence[VlmRow], layout: Layout, made: torch.Tensor | None) -> None:
-        for video in dict.fromkeys(video for row in rows for video in row.videos):
-            frames = dict(zip(video.digests, video.frames, strict=True))
-            if sum(frame.nbytes for frame in frames.values()) > cache.limit_bytes:
-                continue
-            known = cache.found(frames)
-            for digest in frames.keys() - known.keys():
-                cache.keep({digest: frames[digest].copy()})
-            for key in video.ready.keys.values():
-                if made is not None and key in layout.made:
-                    cache.keep({key: made[layout.made[key]].clone()})
+            for video in dict.fromkeys(video for row in rows for video in row.videos):
+                frames = dict(zip(video.digests, video.frames, strict=True))
+                if sum(frame.nbytes for frame in frames.values()) > cache.limit_bytes:
+                    continue
+                for digest in frames.keys() - cache.found(frames).keys():
+                    cache.keep({digest: frames[digest].copy()})
+                for key in video.ready.keys.values():
+                    if made is not None and key in layout.made:
+                        cache.keep({key: made[layout.made[key]].clone()})

@@ -30,12 +30,6 @@ from rfm.qwen.collator import IMAGE_PAD, VIDEO_PAD, VISION_START, QwenCollator
 from rfm.qwen.images import FRAMES_PER_GROUP, MERGE
 from rfm.qwen.network import BackboneConfig
 
-
-def is_at_least(version: int) -> bool:
-    """True if the installed transformers has at least this major version."""
-    return int(importlib.metadata.version("transformers").partition(".")[0]) >= version
-
-
 PROCESSOR_CONFIG = "processor_config.json"
 VIDEO_PREPROCESSOR_CONFIG = "video_preprocessor_config.json"
 # Preprocessing files, and their keys in transformers 5's PROCESSOR_CONFIG.
@@ -213,7 +207,7 @@ def _tokenizer(folder: Path) -> Any:
 
     config = read_json(_required(folder / TOKENIZER_CONFIG))
     special = config.get("extra_special_tokens")
-    if is_at_least(5) or not isinstance(special, list):
+    if not isinstance(special, list) or not importlib.metadata.version("transformers").startswith("4."):
         return AutoTokenizer.from_pretrained(str(folder), use_fast=True, trust_remote_code=False)
     kept = {name: config[name] for name in _KEPT if name in config}
     file = _required(folder / "tokenizer.json")

@@ -5,7 +5,7 @@ So a row's scores do not depend on other rows in its batch, as they would with r
 per layer.
 
 int8: weight int8 [N, K] and scale [N, 1]; a value is weight * scale.
-nf4: weight uint8 [N, K / 2], two codes per byte, and scale float32 [blocks], described in ``rfm.published.nf4``.
+nf4: weight uint8 [N, K / 2], two codes per byte, and scale float32 [blocks], described in ``rfm.published.rounding``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import pad
 
 from rfm.config import Weights
 from rfm.engine.layers import linear
@@ -79,14 +78,10 @@ class Nf4Linear(RoundedLinear):
 
     def __init__(self, layer: nn.Linear, scale: Tensor, decoded: Tensor, rank: int | None) -> None:
         super().__init__(layer, rank)
-        try:
-            from bitsandbytes import functional
-        except ImportError as error:
-            expected = "bitsandbytes, which decodes weights in NF4"
-            raise CheckpointError.at("weights", expected, "none", INSTALL) from error
-        self._bitsandbytes: Any = functional
+        self._bitsandbytes = _bitsandbytes()
         count = self.out_features * self.in_features
-        self._block_size = block_size(count, len(scale))
+        # The power of 2 from which these scales result.
+        self._block_size = max(NF4_BLOCK_SIZES[0], 1 << (math.ceil(count / len(scale)) - 1).bit_length())
         num_blocks = math.ceil(count / self._block_size)
         packed = self.out_features, self.in_features // VALUES_PER_BYTE
         self.register_buffer("weight", torch.empty(packed, dtype=torch.uint8, device="meta"))
@@ -105,6 +100,15 @@ class Nf4Linear(RoundedLinear):
         )
         flat = self._bitsandbytes.dequantize_4bit(self.weight.view(-1, 1), state)
         return flat.view(self.out_features, self.in_features).to(dtype)
+
+
+def _bitsandbytes() -> Any:
+    try:
+        from bitsandbytes import functional
+    except ImportError as error:
+        expected = "bitsandbytes, which decodes weights in NF4"
+        raise CheckpointError.at("weights", expected, "none", INSTALL) from error
+    return functional
 
 
 def may_be_rounded(name: str) -> bool:
@@ -143,22 +147,22 @@ def fit(network: nn.Module, weights: Mapping[str, Tensor], factors: Mapping[str,
 
 
 def rounded(name: str, weight: Tensor, kind: Weights, dtype: torch.dtype) -> dict[str, Tensor]:
-    """Return the tensors for a rounded weight by name.
+    """Return the tensors for a rounded weight by name. Raises CheckpointError if bitsandbytes is missing for NF4.
 
     name: weight name, which ends in ``.weight``
     weight: float32 [N, K]
     dtype: type of decoded values
     """
     if kind == "nf4":
-        return of_layer(name, *quantize(weight), dtype)
+        codes, state = _bitsandbytes().quantize_4bit(weight, blocksize=_NF4_BLOCK_SIZE, quant_type="nf4")
+        return of_layer(name, codes.view(len(weight), -1), state.absmax, dtype)
     scale = (weight.abs().amax(1, keepdim=True) / _MOST).to(dtype)
     steps = weight / torch.where(scale == 0, 1, scale).float()
     return {name: steps.round().clamp(-_MOST, _MOST).to(torch.int8), name.removesuffix(".weight") + SCALE: scale}
 
 
 NF4_BLOCK_SIZES = [2**power for power in range(5, 13)]  # in bitsandbytes, for weights and scales
-_NF4_BITS = 4  # per value
-_NF4_BLOCK_SIZE = 64  # in ``quantize``, bitsandbytes' default
+_NF4_BLOCK_SIZE = 64  # in ``rounded``
 NF4_CODES = (
     -1.0, -0.6961928009986877, -0.5250730514526367, -0.39491748809814453, -0.28444138169288635, -0.18477343022823334,
     -0.09105003625154495, 0.0, 0.07958029955625534, 0.16093020141124725, 0.24611230194568634, 0.33791524171829224,
@@ -170,19 +174,3 @@ def of_layer(name: str, codes: Tensor, scales: Tensor, dtype: torch.dtype) -> di
     """Return a layer's tensors by name. name: weight name; dtype: type of decoded values."""
     path = name.removesuffix(".weight")
     return {name: codes, path + SCALE: scales, path + DECODED: torch.empty(0, dtype=dtype)}
-
-
-def quantize(weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Round a weight, float32 [N, K] with an even K, to codes, uint8 [N, K / 2], and scales, float32 [blocks]."""
-    blocks = pad(weight.flatten(), (0, -weight.numel() % _NF4_BLOCK_SIZE)).view(-1, _NF4_BLOCK_SIZE)
-    scales = blocks.abs().amax(1)
-    codes = torch.tensor(NF4_CODES)
-    middles = (codes[1:] + codes[:-1]) / 2
-    shares = blocks / torch.where(scales == 0, 1, scales)[:, None]
-    nearest = torch.bucketize(shares, middles, out_int32=True).to(torch.uint8).flatten()[: weight.numel()]
-    return (nearest[0::2] << _NF4_BITS | nearest[1::2]).view(len(weight), -1), scales
-
-
-def block_size(num_values: int, num_blocks: int) -> int:
-    """Return how many values a block has, a power of 2."""
-    return max(NF4_BLOCK_SIZES[0], 1 << (math.ceil(num_values / num_blocks) - 1).bit_length())

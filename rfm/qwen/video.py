@@ -16,7 +16,6 @@ import numpy.typing as npt
 from torch import Tensor
 
 from rfm.engine.feature_cache import digests_of
-from rfm.engine.predictor import prefix_indices
 from rfm.engine.threads import IN_TURN, FrameThreads
 from rfm.qwen.images import FRAMES_PER_GROUP
 from rfm_client.contract.samples import UInt8Array
@@ -57,15 +56,6 @@ class VlmVideo:
     conversations: Sequence[Indices]
     named: Sequence[bytes] | None = None
     sized: SizedFrames | None = None
-
-    @classmethod
-    def of(
-        cls, frames: Sequence[UInt8Array] | UInt8Array, frame_steps: int, named: Sequence[bytes] | None = None
-    ) -> VlmVideo:
-        """Return a sample's frames as a video. ``frame_steps``: for dense mode; 0: one conversation with all frames."""
-        count = len(frames)
-        conversations = list(prefix_indices(count, frame_steps)) if frame_steps else [np.arange(count)]
-        return cls(frames, frame_steps or count, conversations, named)
 
     @property
     def ready(self) -> SizedFrames:

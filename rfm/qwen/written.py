@@ -70,8 +70,7 @@ class WritingCollator(LanguageCollator):
         back = torch.arange(-len(self.draft), 1)
         return replace(
             batch,
-            query_rows=batch.query_rows.repeat_interleave(len(back)),
-            query_tokens=(batch.query_tokens[:, None] + back).flatten(),
+            queries=(batch.queries[:, None] + back).flatten(),
         )
 
     def _drafted(self, row: VlmRow) -> VlmRow:

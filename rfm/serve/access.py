@@ -93,10 +93,8 @@ def _checked(text: str, where: str) -> str:
 
 PORTS = range(20_000, 32_000)  # below the ports that Linux assigns to outgoing connections
 PORT_STEP = 20  # keeps the three defaults distinct
-SECURITY_FLOOR = (
-    2,
-    71,
-)  # Triton of NVIDIA's container 26.07; earlier versions have remote vulnerabilities: docs/guides/deploy.md, "Ports"
+# Triton of NVIDIA's container 26.07; earlier versions have remote vulnerabilities: docs/guides/deploy.md, "Ports"
+SECURITY_FLOOR = 2, 71
 _given: deque[int] = deque(maxlen=256)  # ports handed out, whose servers may not listen yet
 
 

@@ -20,11 +20,7 @@ from rfm_client.contract.wire import PROBE_PREFIX
 PROBE_TIMEOUT_S = 1.0  # for requests that involve no model
 
 
-class UnreadableAnswerError(Exception):
-    """A response with a status other than 200, or without JSON."""
-
-
-NO_ANSWER = (OSError, http.client.HTTPException, UnreadableAnswerError)
+NO_ANSWER = (OSError, http.client.HTTPException)
 
 
 class Http:
@@ -47,14 +43,14 @@ class Http:
             connection.close()
 
     def json(self, path: str, timeout_s: float = PROBE_TIMEOUT_S, method: str = "GET") -> Any:
-        """Send a request. Return the response's JSON."""
+        """Send a request. Return the JSON of a response with status 200."""
         status, text = self.request(method, path, timeout_s)
         if status != http.client.OK:
-            raise UnreadableAnswerError(f"{path}: {status} {text}")
+            raise http.client.HTTPException(f"{path}: {status} {text}")
         try:
             return json.loads(text)
         except ValueError as error:
-            raise UnreadableAnswerError(f"{path}: {error}") from error
+            raise http.client.HTTPException(f"{path}: {error}") from error
 
 
 BROKEN_COUNT, BROKEN_S = 3, 30.0  # a model is broken after BROKEN_COUNT failed probes in a row, over BROKEN_S

@@ -161,14 +161,6 @@ def children_of(pid: int) -> Iterator[int]:
             yield from (child.pid for child in psutil.Process(pid).children())
 
 
-def has_ended(pid: int) -> bool:
-    """True for a zombie or an unknown id."""
-    try:
-        return bool(psutil.Process(pid).status() == psutil.STATUS_ZOMBIE)
-    except psutil.NoSuchProcess:
-        return True
-
-
 SHARED_MEMORY = Path("/dev/shm")
 # Prefix of the names of the Python backend's regions. Newer Tritons let no client map a region with this name.
 REGION_PREFIX = "triton_python_backend_shm_region_rfm"

@@ -41,6 +41,7 @@ class Status:
                 self._reason.remove(model, reason)
         for model, reason in reasons.items():
             self._ready.labels(model).set(reason == NO_REASON)
+            self.restarts.labels(model)  # begins at 0, so that the first restart is an increase
             if reason != NO_REASON:
                 self._reason.labels(model, reason).set(1)
         for model in gone:

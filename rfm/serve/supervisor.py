@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import logging
 import signal
-import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -14,6 +13,7 @@ from dataclasses import KW_ONLY, dataclass
 from types import FrameType
 
 from rfm.serve.installation import ServerStartError
+from rfm.serve.probe import NO_ANSWER, Http
 from rfm.serve.processes import ProcessGroup, clear_shared_memory, how_it_ended, stop_signals_to
 from rfm.serve.status import Status, StatusServer
 from rfm.serve.triton_server import POLL_S, Config, SpoiltStartError, TritonServer
@@ -66,7 +66,7 @@ class GatewayProcess:
     """
 
     def __init__(self, command: Sequence[str], address: tuple[str, int], silent_s: float) -> None:
-        self.command, self._address, self._silent_s = command, address, silent_s
+        self.command, self._http, self._silent_s = command, Http(*address), silent_s
         self._group: ProcessGroup | None = None
         self._started_s = 0.0
         self._fault: str | None = None
@@ -82,22 +82,16 @@ class GatewayProcess:
         num_missed = 0
         while group.process.poll() is None:
             try:
-                self._ask()
+                self._http.request("HEAD", "/", self._silent_s / TRIES)
                 num_missed = 0
             except TimeoutError:
                 num_missed += 1
-            except OSError:  # it does not listen yet, or has ended
+            except NO_ANSWER:  # it does not listen yet, has ended, or requires TLS, which is a sign of life
                 num_missed = 0
             if num_missed == TRIES:
                 self._fault = f"no answer for {self._silent_s:g} s"
                 group.kill()
             time.sleep(ASK_S)
-
-    def _ask(self) -> None:
-        """Wait for a sign of life: a response, even one that refuses, or the end of a connection that requires TLS."""
-        with socket.create_connection(self._address, self._silent_s / TRIES) as connection:
-            connection.sendall(b"HEAD / HTTP/1.0\r\n\r\n")
-            connection.recv(1)
 
     def look(self) -> str | None:
         """Restart an ended gateway, at least GATEWAY_PAUSE_S after its start. Return why it ended; None: no restart."""
@@ -122,14 +116,13 @@ class Supervisor:
 
     gateway: a gateway beside the server; None: no gateway
     status_port: port for the status server, on Triton's host; None: no status server
-    probe_s, hang_s, triton_silent_s: see TritonWatch
+    probe_s, triton_silent_s: see TritonWatch
     tell_ready: called once when all models are ready for the first time; None: log a line instead
     """
 
     server: TritonServer
     _: KW_ONLY
     probe_s: float
-    hang_s: float
     triton_silent_s: float
     gateway: GatewayProcess | None = None
     status_port: int | None = None
@@ -138,7 +131,7 @@ class Supervisor:
     def __post_init__(self) -> None:
         self._status = Status()
         self._is_to_stop = threading.Event()
-        self._faults = FaultCount(STEADY_S + self.hang_s)
+        self._faults = FaultCount(STEADY_S + self.server.hang_s)
         self._watch: TritonWatch | None = None  # None: Triton is starting, or has ended
         self._served: dict[str, Config] | None = None  # configurations before the restart; None: first start
 
@@ -147,8 +140,8 @@ class Supervisor:
         for path in clear_shared_memory():
             logger.info("removed %s, left by a killed server", path)
         self._status.record(dict.fromkeys(self.server.models, "it is loading"))
-        for what in (TRITON, *self.server.models, *(() if self.gateway is None else (GATEWAY,))):
-            self._status.restarts.labels(what)  # begins at 0, so that the first restart is an increase
+        for what in (TRITON,) if self.gateway is None else (TRITON, GATEWAY):
+            self._status.restarts.labels(what)  # begins at 0, as those of the models
         port, host = self.status_port, self.server.endpoints.host
         with (
             stop_signals_to(self._stop),
@@ -187,12 +180,7 @@ class Supervisor:
             (self.tell_ready or self._log_ready)()
         self._faults.started()
         self._watch = TritonWatch(
-            self.server,
-            self._status,
-            probe_s=self.probe_s,
-            hang_s=self.hang_s,
-            silent_s=self.triton_silent_s,
-            served=self._served or {},
+            self.server, probe_s=self.probe_s, silent_s=self.triton_silent_s, served=self._served or {}
         )
 
     def _log_ready(self) -> None:

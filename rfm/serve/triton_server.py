@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
 from http import HTTPStatus
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import IO, Any, NoReturn
 from urllib.parse import quote
 
@@ -128,7 +128,7 @@ class TritonServer:
     The server ends with this process, however this process ends.
 
     http_threads: threads that read HTTP requests; None: Triton's choice
-    hang_s: a model process ends itself after a batch makes no progress for this long
+    hang_s: a model without progress for this long counts as hung; in a batch, its process ends itself
     log: file for Triton's log; None: warnings and errors go to this process's standard error
     admin_key: key for the restricted APIs; default: a new random key
     accepts_known_vulnerabilities: True: listen on any address, even with a vulnerable Triton
@@ -147,7 +147,7 @@ class TritonServer:
     more_arguments: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        self._http = Http(self.endpoints.http_host, self.endpoints.http_port, http_headers(self.admin_key))
+        self.http = Http(self.endpoints.http_host, self.endpoints.http_port, http_headers(self.admin_key))
         self._claim: Claim | None = None
         self._signal: int | None = None  # the last signal sent
         self._group: ProcessGroup | None = None  # the newest
@@ -215,9 +215,7 @@ class TritonServer:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def _start_ready(self, served: Mapping[str, Config] | None) -> None:
@@ -280,8 +278,8 @@ class TritonServer:
         processes, ends_s = ModelProcesses(self.pid), time.monotonic() + LOAD_S
         while (status := self.exit_status) is None:
             try:
-                version = self._http.json("/v2", ANSWER_TIMEOUT_S).get("version", "")
-                index = self._http.json(INDEX_PATH, ANSWER_TIMEOUT_S, "POST")
+                version = self.http.json("/v2", ANSWER_TIMEOUT_S).get("version", "")
+                index = self.http.json(INDEX_PATH, ANSWER_TIMEOUT_S, "POST")
             except NO_ANSWER:  # usual while Triton loads
                 self._pause(processes, ends_s)
                 continue
@@ -300,7 +298,7 @@ class TritonServer:
         path = f"/v2/repository/models/{quote(name, safe='')}/load"
         processes, ends_s = ModelProcesses(self.pid), time.monotonic() + LOAD_S
         with ThreadPoolExecutor(1, "rfm-load") as thread:
-            answer = thread.submit(self._http.request, "POST", path, LOAD_S, body)
+            answer = thread.submit(self.http.request, "POST", path, LOAD_S, body)
             while not answer.done():
                 self._pause(processes, ends_s)
         try:

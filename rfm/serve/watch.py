@@ -1,13 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Watch a running Triton: its served models, their readiness, and faults.
+"""Watch a running Triton: its served models, their readiness, and faults (docs/explanation/faults.md).
 
-| fault | found by |
-|---|---|
-| Triton is silent | ``/metrics`` does not respond |
-| a model process is dead or stopped, also during a load | ``ModelProcesses`` |
-| a model hangs outside a batch, or its requests fail before they reach model.py | ``Probe`` |
-
-A process with a hung batch or a broken device ends itself (``rfm.triton_model.watchdog``).
+A silent Triton answers no ``/metrics``; ``ModelProcesses`` finds dead and stopped processes; a ``Probe`` finds a model
+that hangs outside a batch, or whose requests fail before they reach model.py.
 """
 
 from __future__ import annotations
@@ -16,16 +11,15 @@ import logging
 import re
 import threading
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from functools import partial
 from urllib.parse import quote
 
-from rfm.serve.access import http_headers
 from rfm.serve.probe import NO_ANSWER, Http, Probe, can_be_probed
 from rfm.serve.processes import ModelProcesses
 from rfm.serve.repository_api import INDEX_PATH, LOADING, UNLOADING, ModelVersion, versions_of
-from rfm.serve.status import NO_REASON, Status
+from rfm.serve.status import NO_REASON
 from rfm.serve.triton_server import Config, TritonServer
 from rfm_client.contract.description import num_instances
 
@@ -34,7 +28,8 @@ LOOKS = 3  # in a row without an answer, before Triton counts as silent
 _TIMEOUT_S = 1.5
 _INDEX_TIMEOUT_S = 5.0
 _PROGRESS = re.compile(  # counters that grow while a model makes progress
-    r'^(?:nv_inference_request_success|rfm_forward_passes_total)\{[^}]*\bmodel="(?P<model>[^"]+)".*\} (?P<count>\S+)$',
+    r'^(?P<series>(?:nv_inference_request_success|rfm_forward_passes_total)\{[^}]*\bmodel="(?P<model>[^"]+)".*\}) '
+    r"(?P<count>\S+)$",
     re.MULTILINE,
 )
 TRITON = "triton"
@@ -45,30 +40,18 @@ class TritonWatch:
     """Looks at Triton every LOOK_S in its own thread, until ``close``.
 
     probe_s: seconds between a model's probes
-    hang_s: a model without a response for this long counts as hung
     silent_s: a Triton without a response for this long counts as silent
     served: configurations of the models to serve; the watch adds those it finds
     """
 
-    def __init__(
-        self,
-        server: TritonServer,
-        status: Status,
-        *,
-        probe_s: float,
-        hang_s: float,
-        silent_s: float,
-        served: Mapping[str, Config],
-    ) -> None:
-        endpoints = server.endpoints
-        self._http = Http(endpoints.http_host, endpoints.http_port, http_headers(server.admin_key))
-        self._metrics = Http(endpoints.host, endpoints.metrics_port)
-        self._new_probe = partial(Probe, self._http, interval_s=probe_s, hang_s=hang_s)
+    def __init__(self, server: TritonServer, *, probe_s: float, silent_s: float, served: Mapping[str, Config]) -> None:
+        self._http = server.http
+        self._metrics = Http(server.endpoints.host, server.endpoints.metrics_port)
+        self._new_probe = partial(Probe, self._http, interval_s=probe_s, hang_s=server.hang_s)
         self._silent_s = silent_s
-        self._status = status
         self._processes = ModelProcesses(server.pid)
         self._probes: dict[str, Probe] = {}
-        self._counts: dict[str, float] = {}
+        self._counts: dict[str, str] = {}  # by series
         self._progress_s: dict[str, float] = {}  # when a model last made progress
         self._ready: dict[str, list[int]] = {}  # ready versions by model
         self._going: set[str] = set()  # models that are loading or unloading
@@ -113,12 +96,9 @@ class TritonWatch:
                 logger.exception("an unexpected error")
 
     def _note_progress(self, metrics: str) -> None:
-        counts: dict[str, float] = {}
         for match in _PROGRESS.finditer(metrics):
-            counts[match["model"]] = counts.get(match["model"], 0.0) + float(match["count"])
-        for model, count in counts.items():
-            if count != self._counts.get(model):
-                self._counts[model], self._progress_s[model] = count, time.monotonic()
+            if match["count"] != self._counts.get(match["series"]):
+                self._counts[match["series"]], self._progress_s[match["model"]] = match["count"], time.monotonic()
 
     def _dead(self) -> tuple[str, str] | None:
         found = self._processes.fault(self._wanted, is_settled=not self._going)
@@ -158,8 +138,7 @@ class TritonWatch:
             self._forget(model)
         elif model not in self._going and ready != self._ready.get(model):
             path = f"/v2/models/{quote(model, safe='')}/versions/{max(ready)}/config"
-            self.served[model] = serving_just(self._http.json(path), ready)
-            self._status.restarts.labels(model)  # begins at 0, so that the first restart is an increase
+            self.served[model] = {**self._http.json(path), "version_policy": {"specific": {"versions": [*ready]}}}
             before = self._probes.get(model)
             self._forget(model)
             if can_be_probed(self.served[model]):
@@ -182,15 +161,7 @@ class TritonWatch:
         probe = self._probes.get(model)
         if probe is not None and not probe.has_answered:
             return "it has not answered a probe yet"
-        reasons = {part: self._reason(part, versions) for part in parts_of(self.served[model]) if part in self.served}
+        steps = self.served[model].get("ensemble_scheduling", {}).get("step", [])
+        parts = [step["model_name"] for step in steps if step["model_name"] in self.served]
+        reasons = {part: self._reason(part, versions) for part in parts}
         return next((f"{part}: {reason}" for part, reason in reasons.items() if reason != NO_REASON), NO_REASON)
-
-
-def parts_of(config: Config) -> list[str]:
-    """Return the models in an ensemble; empty for other models."""
-    return [step["model_name"] for step in config.get("ensemble_scheduling", {}).get("step", [])]
-
-
-def serving_just(config: Config, versions: Sequence[int]) -> Config:
-    """Return a model's configuration, restricted to these versions."""
-    return {**config, "version_policy": {"specific": {"versions": list(versions)}}}

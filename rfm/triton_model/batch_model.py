@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeAlias, TypeVar
 
 import torch
 
-from rfm.engine.computation import is_by_this_torch
+from rfm.engine.device import TORCH
 from rfm.engine.execution import Execution
 from rfm.parameters import BUDGET_PARAMETER, DEFAULT_HANG_S, HANG_VARIABLE
 from rfm.probe_request import probe_request
@@ -68,17 +68,17 @@ class BatchModel(Generic[Question, Answer]):
         placement.run(lambda: self.load(version, placement.device, settings))
         model = {"model": args["model_name"], "version": args["model_version"]}
         labels = {**model, "device": str(placement.device), "instance": args["model_instance_name"]}
-        sample_types = _sample_types([spec["name"] for spec in config["input"]])
-        self._metrics = InstanceMetrics(
-            labels, _checkpoint(description), sample_types, lambda: self._watchdog.num_steps
-        )
+        origin = {name: getattr(description, name) or "" for name in ("source", "revision", "weights_digest")}
+        checkpoint = {**origin, "network": description.network.get("class", "")}
+        of_samples = wire.SAMPLE_TYPE in [spec["name"] for spec in config["input"]]
+        sample_types = [name for kind, name in SAMPLE_TYPES.items() if issubclass(kind, EncoderSample) != of_samples]
+        self._metrics = InstanceMetrics(labels, checkpoint, sample_types, lambda: self._watchdog.num_steps)
         self._blank_tensors = probe_request(config)
         self._num_warmups = sum(warmup.get("count") or 1 for warmup in config.get("model_warmup", []))
         exported = description.computation
-        if exported and not is_by_this_torch(exported):
-            here = f"torch {torch.__version__}"
+        if exported and TORCH not in exported.split(", "):
             differs = "labels will name the export's computation, %s, but this is %s: export with %s"
-            logger.warning(differs, exported, here, here)
+            logger.warning(differs, exported, TORCH, TORCH)
         if self.works_ahead:
             max_tokens = int(settings.get(BUDGET_PARAMETER) or sys.maxsize)
             self._pipeline = Pipeline(
@@ -281,15 +281,3 @@ def _first_error(answers: Sequence[Any]) -> RewardError | None:
 def _located(error: RewardError, index: int, count: int) -> RewardError:
     """Return an error with its question's index, if the request has several."""
     return error.inside(f"samples[{index}]") if isinstance(error, InvalidSampleError) and count > 1 else error
-
-
-def _sample_types(input_names: Sequence[str]) -> list[str]:
-    """Return the sample types that a model with these inputs scores."""
-    of_samples = wire.SAMPLE_TYPE in input_names
-    return [name for kind, name in SAMPLE_TYPES.items() if issubclass(kind, EncoderSample) != of_samples]
-
-
-def _checkpoint(description: Description) -> dict[str, str]:
-    """Return labels for the served checkpoint: source, revision, digest, and network class."""
-    origin = {name: getattr(description, name) or "" for name in ("source", "revision", "weights_digest")}
-    return {**origin, "network": description.network.get("class", "")}

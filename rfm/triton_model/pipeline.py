@@ -15,7 +15,7 @@ from functools import partial
 from queue import SimpleQueue
 from typing import Any
 
-from rfm.engine.threads import use_threads
+from rfm.engine.threads import num_preparing, use_threads
 from rfm.triton_model.placement import Placement
 from rfm.triton_model.request import Request
 from rfm.triton_model.watchdog import end
@@ -48,7 +48,9 @@ class Pipeline:
         self._call: Callable[[], None] | None = None  # what ``run`` gives the scoring thread to do
         self._is_scoring = self._is_closed = False
         self._scored: SimpleQueue[Any] = SimpleQueue()  # None ends it
-        self._preparing = ThreadPoolExecutor(placement.num_preparing, "rfm-prepare", partial(use_threads, 1))
+        self._preparing = ThreadPoolExecutor(
+            num_preparing(placement.device, placement.num_threads), "rfm-prepare", partial(use_threads, 1)
+        )
         self._threads = [
             threading.Thread(target=_to_the_end, args=(stage,), name=f"rfm-{name}", daemon=True)
             for name, stage in {"score": self._score_all, "reply": self._reply_to_all}.items()

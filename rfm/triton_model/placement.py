@@ -17,7 +17,7 @@ from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.engine.device import use
 from rfm.engine.layers import keep_float32
-from rfm.engine.threads import num_preparing, use_threads
+from rfm.engine.threads import use_threads
 from rfm.files import CheckpointError, is_there, weights_digest
 from rfm.parameters import THREADS_PARAMETER
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description, num_instances
@@ -31,11 +31,6 @@ class Placement:
 
     device: torch.device
     num_threads: int
-
-    @property
-    def num_preparing(self) -> int:
-        """How many requests are prepared at the same time."""
-        return num_preparing(self.device, self.num_threads)
 
     @classmethod
     def of(cls, args: Mapping[str, str], config: Mapping[str, Any], settings: Mapping[str, str]) -> Placement:
@@ -74,17 +69,12 @@ def check_digest(version: Path, expected: str | None) -> None:
     """
     kept = version / "config.pbtxt"
     if is_there(kept):
-        expected = _digest_in(kept)
+        try:
+            config = text_format.Parse(kept.read_text(), pb.ModelConfig())
+            expected = Description.parse(config.parameters[DESCRIPTION_PARAMETER].string_value).weights_digest
+        except (OSError, ValueError, text_format.ParseError) as error:
+            raise CheckpointError.at(kept, "a configuration of the export", error, "export again") from error
     if expected and (got := weights_digest([version])) != expected:
         raise CheckpointError.at(
             version, f"the weights that were exported ({expected})", f"others ({got})", "export them again"
         )
-
-
-def _digest_in(file: Path) -> str | None:
-    """Return the weights' digest from an exported configuration; None: unknown."""
-    try:
-        config = text_format.Parse(file.read_text(), pb.ModelConfig())
-        return Description.parse(config.parameters[DESCRIPTION_PARAMETER].string_value).weights_digest
-    except (OSError, ValueError, text_format.ParseError) as error:
-        raise CheckpointError.at(file, "a configuration of the export", error, "export again") from error

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""rfm-client status, wait, sample and bench-input; exit codes; servers that go away, and URLs with a wrong port."""
+"""rfm-client status, wait and sample; exit codes; servers that go away, and URLs with a wrong port."""
 
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
 import socket
@@ -25,7 +26,7 @@ from engine_server import EngineServer
 from gateways import running
 from in_process import rfm_client_app
 from proxies import Proxy
-from rfm_client import InvalidSampleError, RewardClient, ServerUnavailableError, Trajectory
+from rfm_client import InvalidSampleError, RewardClient, ServerError, Trajectory
 from rfm_client.command_line import ExitCode
 from servers import Endpoints, RepositoryApi, Served, folder_server, wait_for
 from trajectories import random_trajectory
@@ -51,6 +52,7 @@ def test_status_reports_the_counts_of_triton(served: Served) -> None:
         return server, {model["name"]: model for model in server["models"]}
 
     wait_for(lambda: (shown()[1][MODEL]["batches"] or {"count": 0})["count"])  # the model reports once a second
+    wait_for(lambda: all(device["memory_used_bytes"] for device in shown()[0]["devices"]))  # first after two seconds
     server, models = shown()
     assert (server["ready"], server["version"], server["metrics_error"]) == (True, "2.51.0", None)
     with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
@@ -123,12 +125,10 @@ def test_status_without_metrics_shows_the_rest_and_says_so(served: Served) -> No
     assert (requests[1:3], requests[5:]) == (["1", "READY"], ["-", "-"])
 
 
-def test_synthetic_samples_are_frames_where_embeddings_are_not_read(engines: EngineServer, tmp_path: Path) -> None:
+def test_synthetic_samples_are_frames_where_embeddings_are_not_read(engines: EngineServer) -> None:
     result = ask(engines, "sample", "--num-samples", 2, model=VLM)
     assert (result.exit_code, result.stderr) == (0, "")
     assert "progress of random frames" in result.stdout
-    written = ask(engines, "bench-input", "--num-samples", 1, "--output", tmp_path / "input.json", model=VLM)
-    assert written.stdout.startswith(f"perf_analyzer -m {VLM}_frames ")
 
 
 def free_url() -> str:
@@ -161,7 +161,10 @@ def test_wait_returns_when_the_model_is_ready_or_its_time_is_up(engines: EngineS
     result = invoke("wait", "--url", url, "--timeout", 0.2)
     assert result.exit_code == ExitCode.DEADLINE
     remedy = "start a server there (rfm serve), or wait longer (--timeout)"
-    assert result.stderr == f"rfm-client: {url}: rfm and rfm_frames: not ready within 0.2 s: {remedy}\n"
+    assert (
+        result.stderr
+        == f"rfm-client: {url}: rfm and rfm_frames: not ready within 0.2 s: {url}: no connection: Connection refused: {remedy}\n"
+    )
 
 
 def test_an_interrupt_ends_it_without_a_traceback() -> None:
@@ -192,6 +195,25 @@ def test_an_option_wins_over_its_variable() -> None:
         assert f"got {winner}: No such file or directory" in " ".join(result.stderr.split())
 
 
+def test_an_api_key_is_read_once_so_that_a_pipe_will_do(tmp_path: Path) -> None:
+    np.save(tmp_path / "clip.npy", np.zeros((2, 8, 8, 3), np.uint8))
+    pipe, end = os.pipe()
+    os.write(end, b"key")
+    os.close(end)
+    result = invoke(
+        "score",
+        tmp_path / "clip.npy",
+        "--task",
+        "x",
+        "--url",
+        "grpc://127.0.0.1:1",
+        "--api-key-file",
+        f"/dev/fd/{pipe}",
+    )
+    os.close(pipe)
+    assert result.exit_code == ExitCode.UNAVAILABLE, result.stderr
+
+
 def test_a_bad_variable_hurts_no_command_that_does_not_need_it() -> None:
     assert invoke("score", "--help", env=VARIABLE).exit_code == ExitCode.OK
 
@@ -208,57 +230,45 @@ def test_exit_codes_are_documented_with_every_command() -> None:
     for code in ExitCode:
         assert re.search(rf"\b{code.value} ", exit_codes), code
     commands = get_command(rfm_client_app).commands  # type: ignore[attr-defined]
-    assert len(commands) == 9
+    assert len(commands) == 8
     for name in commands:
         assert exit_codes in " ".join(invoke(name, "--help").stdout.split())
 
 
 NUM_SOURCES = 1000  # more than are scored before the server is gone
 NOT_ASKED = "not asked, since no server answers any more"
-UNLESS = "unless the server was given another"
+NO_GRPC = "no answer of Triton's gRPC port (by default 8001)"
+OF_HTTP = "Triton's HTTP port (by default 8000)"
 PORTS = {
-    ("grpc", "http_port"): "Triton's gRPC port, got its HTTP port: use http://{address}",
-    ("http", "grpc_port"): "Triton's HTTP port, got its gRPC port: use grpc://{address}",
-    ("grpc", "metrics_port"): f"Triton's gRPC port, got its metrics port: use grpc://127.0.0.1:8001, {UNLESS}",
-    ("http", "metrics_port"): f"Triton's HTTP port, got its metrics port: use http://127.0.0.1:8000, {UNLESS}",
+    ("grpc", "http_port"): (ExitCode.UNAVAILABLE, NO_GRPC),
+    ("grpc", "metrics_port"): (ExitCode.UNAVAILABLE, NO_GRPC),
+    ("http", "grpc_port"): (ExitCode.FAILED, OF_HTTP),
+    ("http", "metrics_port"): (ExitCode.FAILED, OF_HTTP),
 }
 
 
 @pytest.mark.parametrize(("scheme", "port"), PORTS)
 def test_the_error_for_a_wrong_port_names_the_right_one(demo_server: Endpoints, scheme: str, port: str) -> None:
-    address = f"127.0.0.1:{getattr(demo_server, port)}"
-    expected = f"{scheme}://{address}: expected {PORTS[scheme, port].format(address=address)}"
-    for command in ("sample", "status", "wait"):
-        result = invoke(command, "--url", f"{scheme}://{address}")
-        assert result.exit_code == ExitCode.UNAVAILABLE
-        assert result.stderr.splitlines()[-1] == f"rfm-client: {expected}"
-    with RewardClient(f"{scheme}://{address}", retry=False) as client, pytest.raises(ServerUnavailableError) as caught:
-        client.model_info()
-    assert str(caught.value) == expected
+    url = f"{scheme}://127.0.0.1:{getattr(demo_server, port)}"
+    code, expected = PORTS[scheme, port]
+    for command in ("sample", "status"):
+        result = invoke(command, "--url", url)
+        assert (result.exit_code, expected in result.stderr) == (code, True), result.stderr
+    result = invoke("wait", "--url", url, "--timeout", 0.5)
+    assert (result.exit_code, expected in result.stderr) == (ExitCode.DEADLINE, True), result.stderr
 
 
-def test_the_error_for_tls_to_a_server_without_it_names_the_plain_url(demo_server: Endpoints) -> None:
-    for url in (demo_server.grpc_url, demo_server.http_url):
-        secure = url.replace("://", "s://")
-        with RewardClient(secure, retry=False) as client, pytest.raises(ServerUnavailableError) as caught:
+def test_the_error_for_tls_to_a_server_without_it_names_the_plain_scheme(demo_server: Endpoints) -> None:
+    for url, remedy in ((demo_server.grpc_url, "use grpc://"), (demo_server.http_url, "with TLS: grpcs:")):
+        with RewardClient(url.replace("://", "s://"), retry=False) as client, pytest.raises(ServerError, match=remedy):
             client.model_info()
-        assert " with TLS, got its " in str(caught.value)
-        assert str(caught.value).endswith(f" without: use {url}")
 
 
-def test_a_gateway_is_no_triton(demo_server: Endpoints, tmp_path: Path) -> None:
-    with running(demo_server, tmp_path) as gateway:
-        for url in (gateway.url, gateway.url.replace("http", "grpc")):
-            result = invoke("sample", "--url", url)
-            assert result.exit_code == ExitCode.UNAVAILABLE
-            assert "got a gateway's: use that of the Triton behind it, by default 800" in result.stderr
-
-
-def test_the_port_of_another_program_is_not_mistaken_for_one_of_triton(tmp_path: Path) -> None:
-    with folder_server(tmp_path) as url:
-        result = invoke("sample", "--url", url)
-    assert result.exit_code != ExitCode.OK
-    assert "expected Triton's" not in result.stderr
+def test_a_gateway_and_a_folder_are_no_triton(demo_server: Endpoints, tmp_path: Path) -> None:
+    with running(demo_server, tmp_path) as gateway, folder_server(tmp_path) as folder:
+        assert NO_GRPC in invoke("sample", "--url", gateway.url.replace("http", "grpc")).stderr
+        for url in (gateway.url, folder):
+            assert f"expected {OF_HTTP}, got " in invoke("sample", "--url", url).stderr
 
 
 ENDS = {"has gone": ExitCode.UNAVAILABLE, "hangs": ExitCode.DEADLINE}

@@ -7,6 +7,7 @@ import base64
 import importlib.metadata
 import json
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -18,16 +19,18 @@ import pytest
 import clip
 from client_commands import MODEL, RFM_CLIENT, TASK, ask, assert_scores, invoke
 from engine_server import EngineServer
-from rfm_client import FrameScores, ProgressResult
+from paths import ROOT
+from rfm_client import FrameScores, PreferenceSample, ProgressResult, ProgressSample, Sample
 from rfm_client.cli.documents import frame_document
+from rfm_client.cli.options import SyntheticSamples
 from rfm_client.cli.scoring import unique_stems
 from rfm_client.cli.show import shortened, status_tables
-from rfm_client.cli.synthetic import SyntheticSamples, parse_lengths
 from rfm_client.command_line import ExitCode, number
 from rfm_client.contract.wire import encode_samples
 from rfm_client.serving import ServerStatus
 from rfm_client.transport.status import ModelStatus
 from servers import Endpoints
+from trajectories import random_trajectory
 
 WIDTH = 80  # of a terminal
 NAMES = ("episode_a.mp4", "episode_b.mp4")
@@ -51,14 +54,11 @@ def shown(url: str, *asked: object, code: ExitCode = ExitCode.OK) -> tuple[set[s
     return {*result.stdout.split()}, result.stdout
 
 
-def test_status_fits_a_terminal_and_ends_with_commands_to_try_next(demo_server: Endpoints) -> None:
+def test_status_fits_a_terminal(demo_server: Endpoints) -> None:
     url = demo_server.grpc_url
-    words, told = shown(url, "status", "--metrics-url", demo_server.metrics_url)
+    words, _ = shown(url, "status", "--metrics-url", demo_server.metrics_url)
     heads = {"model", "v", "state", "requests", "failed", "refused", "pending", "batches", "samples", "queue", "ms"}
     assert heads | {"rfm", "rfm_encoder", "rfm_frames"} <= words
-    assert f"rfm-client score VIDEO --task TASK --url {url}" in told
-    assert f"rfm-client gateway --port 8100 --triton {url}" in told
-    assert "http://localhost:8100/" in told
 
 
 def test_scores_and_comparisons_fit_a_terminal_and_name_each_file(engines: EngineServer, videos: list[Path]) -> None:
@@ -106,16 +106,13 @@ SAMPLES = {"embeddings": ("progress", False), "pairs": ("similarity", False), "f
 
 
 @pytest.mark.parametrize(("kind", "use_frames"), SAMPLES.values(), ids=SAMPLES)
-def test_sample_and_bench_input_ask_for_the_same_samples(
-    engines: EngineServer, tmp_path: Path, kind: Any, use_frames: bool
-) -> None:
-    words = ["--sample-type", kind, "--num-samples", 3, "--num-frames", "2,5", "--seed", 5]
+def test_sample_scores_synthetic_samples(engines: EngineServer, kind: Any, use_frames: bool) -> None:
+    words = ["--sample-type", kind, "--num-samples", 3, "--num-frames", 5]
     words += ["--use-frames"] if use_frames else []
     result = ask(engines, "sample", *words, "--json", "-")
     assert (result.exit_code, result.stderr) == (0, "")
     with engines.client(MODEL) as client:
-        samples = SyntheticSamples(kind, 3, parse_lengths("2,5"), use_frames, seed=5).samples(client)
-        expected = client.evaluate(samples)
+        expected = client.evaluate(SyntheticSamples(kind, 3, 5, use_frames).samples(client))
     for answer, scores in zip(json.loads(result.stdout)["samples"], expected, strict=True):
         if isinstance(scores, ProgressResult):
             assert_scores(answer, scores)
@@ -124,12 +121,15 @@ def test_sample_and_bench_input_ask_for_the_same_samples(
             for name in ("first", "second") if kind == "preference" else ("reference", "other"):
                 assert_scores(answer[name], getattr(scores, name))
 
-    target = tmp_path / "input.json"
-    result = ask(engines, "bench-input", *words, "--output", target)
-    name = f"{MODEL}_frames" if use_frames else MODEL
-    command = f"perf_analyzer -m {name} -i grpc -u {engines.url.removeprefix('grpc://')} --input-data {target}"
-    assert result.stdout == f"{command} --async --concurrency-range 1:16:5\n"
-    for request, sample in zip(json.loads(target.read_text())["data"], samples, strict=True):
+
+def test_the_input_for_perf_analyzer_has_the_tensors_of_each_sample(tmp_path: Path) -> None:
+    samples: list[Sample] = [
+        ProgressSample(random_trajectory(0, 3)),
+        PreferenceSample(random_trajectory(1, 2), random_trajectory(2, 4)),
+    ]
+    write = runpy.run_path(str(ROOT / "benchmarks" / "perf_input.py"))["write"]
+    write(tmp_path / "input.json", samples)
+    for request, sample in zip(json.loads((tmp_path / "input.json").read_text())["data"], samples, strict=True):
         tensors = encode_samples([sample])
         assert request.keys() == tensors.keys()
         for tensor, array in tensors.items():  # as perf_analyzer reads them, with the batch axis that it adds
@@ -142,7 +142,7 @@ def test_sample_and_bench_input_ask_for_the_same_samples(
 
 
 def test_sample_shows_a_table_and_an_error_line_per_failed_sample(engines: EngineServer) -> None:
-    result = ask(engines, "sample", "--sample-type", "preference", "--num-samples", 2, "--num-frames", "3,17")
+    result = ask(engines, "sample", "--sample-type", "preference", "--num-samples", 2, "--num-frames", 17)
     assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
     for index, line in enumerate(result.stderr.splitlines()):
         assert line.startswith(f"rfm-client: samples[{index}]: num_frames: expected at most 16")
@@ -159,7 +159,7 @@ def test_a_score_that_is_not_predicted_is_null_in_json_and_shown_as_a_dash() -> 
     assert [number(value) for value in (None, float("nan"), 0.5)] == ["-", "-", "0.5000"]
 
 
-def test_files_about_videos_of_one_name_do_not_overwrite_each_other() -> None:
+def test_videos_of_one_name_are_told_apart() -> None:
     names = ["a/clip.mp4", "b/clip.mp4", "http://host/clip.mp4?size=2", "other.tar.mp4"]
-    assert unique_stems(names) == ["clip", "clip_2", "clip_3", "other.tar"]
-    assert unique_stems(["x/a.mp4", "a_2.mp4", "y/a.mp4"]) == ["a", "a_2", "a_3"]
+    assert unique_stems(names) == ["1_clip", "2_clip", "3_clip", "4_other.tar"]
+    assert unique_stems(names[1:2] + names[3:]) == ["clip", "other.tar"]

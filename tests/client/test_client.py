@@ -17,6 +17,8 @@ from engines import load_engine
 from mixtures import FRAMES_MODEL, assert_same, mixed_samples
 from rfm_client import (
     FRAME_SCORES,
+    AccessDeniedError,
+    DeadlineExceededError,
     InvalidSampleError,
     ModelInfo,
     ModelNotFoundError,
@@ -180,6 +182,47 @@ def test_a_model_without_a_description_is_scored() -> None:
         assert client.progress(filmed(2)).unclear is None
 
 
+class Secretive(Shelf):
+    """Denies access to the descriptions. num_asked: how often it was asked for one"""
+
+    num_asked = 0
+
+    async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
+        self.num_asked += 1
+        raise AccessDeniedError("no access")
+
+
+def test_embeddings_are_scored_without_a_description_which_is_asked_for_once() -> None:
+    shelf = Secretive()
+    with RewardClient("", transports=[shelf]) as client:
+        for _ in range(3):
+            client.progress(random_trajectory(0, 2))
+        assert (shelf.num_asked, shelf.count) == (1, 3)
+        with pytest.raises(AccessDeniedError):  # which scores there are is not known
+            client.progress(random_trajectory(0, 2), all_scores=True)
+
+
+class Hanging(Described):
+    """Takes long to score."""
+
+    async def infer(self, *arguments: Any, **options: Any) -> Answer:
+        await asyncio.sleep(60)
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize("by_digest", [False, True])
+def test_a_call_that_waits_in_vain_for_its_turn_names_its_request(by_digest: bool) -> None:
+    shelf = Hanging()
+    shelf.more = {"by_digest": by_digest}
+    with RewardClient("", transports=[shelf], max_in_flight=1) as client:
+        open_call = client.submit(ProgressSample(filmed(1)))
+        with pytest.raises(DeadlineExceededError, match=r"^no answer within 0\.1 s \(request mine-1\)$"):
+            client.progress(filmed(1), timeout_s=0.1, request_id="mine")
+        with pytest.raises(DeadlineExceededError, match=r"^no answer within 0\.1 s \(request \w+-1\)$"):
+            client.episode("lift", timeout_s=0.1).add(filmed(1).positions[0])
+        open_call.cancel()
+
+
 def test_a_step_has_each_score_that_the_checkpoint_gives_unasked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(FRAME_SCORES, "log_prob", replace(FRAME_SCORES["log_prob"], asked="if given"))  # type: ignore[arg-type]
     names = [name for name, score in FRAME_SCORES.items() if score.asked == "if given"]
@@ -188,12 +231,10 @@ def test_a_step_has_each_score_that_the_checkpoint_gives_unasked(monkeypatch: py
     (frame,) = filmed(1).positions
     with RewardClient("", transports=[shelf]) as client:
         step = client.episode("stack", cameras=("front", "wrist")).add({"front": frame, "wrist": frame})
-        steps = client.episodes(2, "stack").add([frame, frame], mask=[False, True])
     expected = {name: True if FRAME_SCORES[name].mark else pytest.approx(0.1) for name in names}
-    assert step.more_scores == steps.of(1).more_scores == expected
+    assert step.more_scores == expected
     assert names == [*step.more_scores]
-    np.testing.assert_allclose(steps.more_scores["log_prob"], [np.nan, 0.1])
-    assert steps.unclear.tolist() == [False, True]
+    assert step.unclear
 
 
 MORE = "trajectory: expected at most 16 frames, as in the training of "

@@ -3,14 +3,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tritonclient.grpc
+from tritonclient.utils import InferenceServerException
 
 from callers import WIDTHS
 from commands import in_shared_memory
@@ -26,6 +29,8 @@ from rfm_client import (
     ServerUnavailableError,
     Trajectory,
 )
+from rfm_client.contract.triton import LOST_REGION
+from rfm_client.transport.shared_memory import MIN_SHARED_BYTES, SharedMemory
 from servers import PATIENCE_S, Endpoints, Served, start_triton
 from trajectories import random_trajectory
 
@@ -171,6 +176,54 @@ def test_closing_a_client_of_a_hanging_server_frees_its_shared_memory(demo_serve
         with proxy.held():
             client.close()
             assert ours_in_dev_shm() == before
+
+
+class RestartedServer:
+    """Stands for tritonclient's client. mapped: names of the server's regions"""
+
+    def __init__(self) -> None:
+        self.mapped: set[str] = set()
+
+    async def register_system_shared_memory(self, name: str, *_: object) -> None:
+        self.mapped.add(name)
+
+    async def unregister_system_shared_memory(self, name: str) -> None:
+        self.mapped.discard(name)
+
+
+def test_a_late_word_of_a_restart_keeps_the_memory_mapped_since() -> None:
+    server, memory = RestartedServer(), SharedMemory("grpc://127.0.0.1:1")
+    large = np.zeros(MIN_SHARED_BYTES, np.uint8)
+
+    async def call() -> str:
+        async with memory.lend(server, large) as region:
+            assert region is not None
+            await asyncio.sleep(0)
+            if region.name not in server.mapped:
+                raise InferenceServerException(f"{LOST_REGION}: '{region.name}'")
+            return region.name
+
+    async def late(known: asyncio.Event) -> None:
+        async with memory.lend(server, large):
+            await known.wait()
+            raise InferenceServerException(LOST_REGION)
+
+    async def ask() -> None:
+        known = asyncio.Event()
+        waiting = asyncio.create_task(late(known))
+        await call()
+        server.mapped.clear()  # a restart
+        with pytest.raises(InferenceServerException, match=LOST_REGION):
+            await call()
+        name = await call()
+        known.set()
+        with pytest.raises(InferenceServerException, match=LOST_REGION):
+            await waiting
+        assert await call() == name
+        await memory.close(server)
+        assert not server.mapped
+
+    asyncio.run(ask())
 
 
 def test_a_server_that_refuses_shared_memory_is_warned_of_once(

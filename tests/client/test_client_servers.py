@@ -175,6 +175,25 @@ def test_a_server_that_hangs_costs_one_call_and_is_left_out() -> None:
     assert [type(each) for each in outcomes if isinstance(each, Exception)] == [DeadlineExceededError]
 
 
+class Flapping(Stand):
+    """Fails, but every other probe finds it ready."""
+
+    async def is_ready(self, model: str, timeout_s: float) -> bool:
+        self.asked["is_ready"] += 1
+        return self.asked["is_ready"] % 2 == 0
+
+
+def test_a_server_that_fails_while_it_reports_ready_rests_longer_each_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rfm_client.transport.servers.FIRST_PAUSE_S", 0.4)
+    flapping, good = Flapping("grpc://flapping:1", InferenceFailedError("it failed")), Stand("grpc://good:1")
+    end_s = time.monotonic() + 1.5
+    with RewardClient("", transports=[flapping, good]) as client:
+        while time.monotonic() < end_s:
+            client.progress(SEEN)
+    assert flapping.asked["infer"] <= 3  # after rests of at least 0.2 and 0.4 s, each with a pause between probes
+    assert flapping.asked["is_ready"] <= 6
+
+
 @pytest.mark.parametrize(
     ("others", "kind"),
     [

@@ -15,7 +15,6 @@ import pytest
 import transports
 from engine_server import EngineServer
 from rfm_client import (
-    AsyncRewardClient,
     FrameSize,
     InvalidSampleError,
     ProgressResult,
@@ -47,6 +46,13 @@ def offline(client: RewardClient, frames: UInt8Array, sampling: Sampling = FOUR,
 
 def online(episode: Episode, frames: UInt8Array) -> tuple[list[float], list[float]]:
     return of_steps([episode.add(frame) for frame in frames])
+
+
+def added(client: RewardClient, episodes: Sequence[Episode], frames: UInt8Array) -> list[StepScore]:
+    """Keep a frame in each episode, and score all."""
+    for episode, frame in zip(episodes, frames, strict=True):
+        episode.keep(frame)
+    return client.score_episodes(episodes)
 
 
 def of_steps(scores: Sequence[StepScore]) -> tuple[list[float], list[float]]:
@@ -150,19 +156,20 @@ def test_episodes_are_shared_out_among_servers_and_stay(engines: EngineServer) -
     videos = np.stack([video(seed, 6) for seed in range(210, 216)], axis=1)  # [T, N, H, W, 3]
     with RewardClient([], transports=transports, model=MODEL) as client:
         tasks = [TASK, "open the drawer"] * 3
-        episodes = client.episodes(6, tasks, frames=4)
-        added = [episodes.add(frames) for frames in videos]
+        episodes = [client.episode(task, frames=4) for task in tasks]
+        steps = [added(client, episodes, frames) for frames in videos]
         for transport in transports:
             assert [len(inputs["num_frames"]) for inputs in transport.requests] == [2] * len(videos)
             assert transport.most_bytes < 2 * (videos[0, 0].nbytes + 512)
         first, second, third = (transport.digests for transport in transports)
         assert len(first | second | third) == len(first) + len(second) + len(third) == videos[:, :, 0, 0, 0].size
         for index, task in enumerate(tasks):
-            assert_same(of_steps([step.of(index) for step in added]), offline(client, videos[:, index], task=task))
+            assert_same(of_steps([step[index] for step in steps]), offline(client, videos[:, index], task=task))
         for transport in transports:
             transport.requests.clear()
-        episodes.reset([True, True, True, False, False, False])
-        episodes.add(videos[0])
+        for episode in episodes[:3]:
+            episode.reset()
+        added(client, episodes, videos[0])
         asked = [sum(len(inputs["num_frames"]) for inputs in transport.requests) for transport in transports]
         assert asked == [2, 2, 2]  # the new ones went to the servers with the fewest
 
@@ -171,34 +178,28 @@ def test_episodes_of_a_server_that_is_down_go_on_at_the_next(engines: EngineServ
     transports = [Failing(engines.url) for _ in range(2)]
     videos = np.stack([video(seed, 6) for seed in (220, 221)], axis=1)
     with RewardClient([], transports=transports, model=MODEL, timeout_s=30) as client:
-        episodes = client.episodes(2, TASK, frames=4)
-        added = [episodes.add(frames) for frames in videos[:3]]
+        episodes = [client.episode(TASK, frames=4) for _ in range(2)]
+        steps = [added(client, episodes, frames) for frames in videos[:3]]
         transports[0].is_down = True
-        added += [episodes.add(frames) for frames in videos[3:]]
+        steps += [added(client, episodes, frames) for frames in videos[3:]]
         assert len(transports[0].requests) == 3
         assert transports[1].most_bytes < videos[0, 0].nbytes + 512  # it knew the frames, since both are one server
         for index in range(2):
-            assert_same(of_steps([step.of(index) for step in added]), offline(client, videos[:, index]))
+            assert_same(of_steps([step[index] for step in steps]), offline(client, videos[:, index]))
 
 
-def test_a_mask_leaves_episodes_out_and_a_reset_begins_some_anew(client: RewardClient) -> None:
+def test_some_episodes_grow_and_a_reset_begins_one_anew(client: RewardClient) -> None:
     frames = video(103, 4)
-    episodes = client.episodes(2, TASK, frames=4)
-    episodes.add(frames[[0, 1]])
-    scores = episodes.add([None, frames[2]], mask=[False, True])
-    assert np.isnan([scores.progress[0], scores.success[0]]).all()
-    assert not scores.succeeded[0]
-    assert scores.step.tolist() == [0, 1]
-    assert scores.progress[1] == pytest.approx(offline(client, frames[[1, 2]]).progress[-1], abs=TOLERANCE)
-    episodes.reset([False, True], task="open the drawer")
-    scores = episodes.add(frames[[3, 3]])
-    assert scores.step.tolist() == [1, 0]
+    episodes = [client.episode(TASK, frames=4) for _ in range(2)]
+    added(client, episodes, frames[:2])
+    (score,) = added(client, episodes[1:], frames[2:3])
+    assert [episode.step for episode in episodes] == [0, 1]
+    assert score.progress == pytest.approx(offline(client, frames[[1, 2]]).progress[-1], abs=TOLERANCE)
+    episodes[1].reset("open the drawer")
+    scores = added(client, episodes, frames[[3, 3]])
+    assert [score.step for score in scores] == [1, 0]
     expected = offline(client, frames[[3]], task="open the drawer").progress[-1]
-    assert scores.progress[1] == pytest.approx(expected, abs=TOLERANCE)
-    with pytest.raises(ValueError, match="expected one for each of 3 episodes"):
-        client.episodes(3, ["a", "b"])
-    with pytest.raises(ValueError, match=r"mask: expected bool \[2\], got int64 \[2\]"):
-        episodes.add(frames[[0, 1]], mask=[0, 1])
+    assert scores[1].progress == pytest.approx(expected, abs=TOLERANCE)
 
 
 def test_cameras_are_scored_apart_and_fused(client: RewardClient) -> None:
@@ -208,7 +209,7 @@ def test_cameras_are_scored_apart_and_fused(client: RewardClient) -> None:
         episode = client.episode(TASK, frames=4, cameras=("front", "wrist"), fuse=fuse)  # type: ignore[arg-type]
         scores = [episode.add({"front": a, "wrist": b}) for a, b in zip(front, wrist, strict=True)]
         np.testing.assert_allclose(scores[-1].progress, expected, atol=TOLERANCE)
-    wanted = r"frames: expected frames of the cameras \['front', 'wrist'\], got frames of \['front'\]"
+    wanted = r"frame: expected frames of the cameras \['front', 'wrist'\], got frames of \['front'\]"
     with pytest.raises(InvalidSampleError, match=wanted):
         episode.add({"front": front[0]})
 
@@ -233,56 +234,16 @@ def test_a_frame_that_is_wrong_leaves_the_episode_as_it_was(client: RewardClient
         episode.add(video(0, 1, (8, 8))[0])
     first = client.episode(TASK, frames=4).add(frames[0])
     assert_same(of_steps([first, *map(episode.add, frames[1:])]), offline(client, frames))
-    episodes = client.episodes(2, TASK, frames=4)
-    with pytest.raises(InvalidSampleError, match=r"^episodes\[1\]\.frame: expected uint8 \[H, W, 3\]"):
-        episodes.add([frames[0], np.zeros((2, 2, 3))])
-    assert episodes.add(frames[:2]).step.tolist() == [0, 0]
 
 
-def test_the_newest_frame_takes_the_place_of_one_that_waits(client: RewardClient) -> None:
-    frames, episode = video(108, 30), client.episode(TASK, frames=4)
-    answers = [episode.add_nowait(frame) for frame in frames]
-    score = answers[-1].result()
-    taken = [index for index, answer in enumerate(answers) if not answer.cancelled()]
-    assert score.step == len(taken) - 1
-    assert (taken[0], taken[-1]) == (0, len(frames) - 1)
-    assert 1 < len(taken) < len(frames)
-    expected = offline(client, frames[taken])
-    np.testing.assert_allclose(score.progress, expected.progress[-1], atol=TOLERANCE)
-    with pytest.raises(InvalidSampleError, match="frame: expected uint8"):
-        episode.add_nowait(np.zeros((2, 2, 3))).result()
-    episode.reset("open the drawer")
-    assert episode.add(frames[0]).step == 0
-
-
-def test_frames_stay_in_the_order_in_which_they_were_added(engines: EngineServer, client: RewardClient) -> None:
-    """With and without waiting, with a reset in between, and after a caller stops waiting."""
-    frames = video(113, 5)
-
-    async def play() -> tuple[list[float], list[int]]:
-        async with AsyncRewardClient(engines.url, model=MODEL) as client:
-            episode = client.episode(TASK, frames=4)
-            open_, waiting = episode.add_nowait(frames[0]), episode.add_nowait(frames[3])
-            second = await episode.add(frames[1])
-            assert open_.done()
-            assert waiting.cancelled()
-            buffer = frames[2].copy()
-            third = episode.add_nowait(buffer)
-            buffer[:] = 0  # drawn over before it was sent
-            await episode.reset()
-            again = episode.add_nowait(frames[0])
-            reset = asyncio.create_task(episode.reset())
-            await asyncio.sleep(0)
-            reset.cancel()
-            await again  # no answer is lost
-            episode.add_nowait(frames[3]).cancel()  # then it is not part of the episode
-            scores = [open_.result(), second, third.result(), again.result(), await episode.add(frames[4])]
-            return [score.progress for score in scores], [score.step for score in scores]
-
-    progress, steps = asyncio.run(play())
-    assert steps == [0, 1, 2, 0, 1]
-    expected = [*offline(client, frames[:3]).progress, *offline(client, frames[[0, 4]]).progress]
-    np.testing.assert_allclose(progress, expected, rtol=0, atol=TOLERANCE)
+def test_a_frame_that_is_wrong_among_several_leaves_all_episodes_as_they_were(client: RewardClient) -> None:
+    frames = video(109, 3)
+    episodes = [client.episode(TASK, env=env, frames=4) for env in range(3)]
+    added(client, episodes, frames)
+    with pytest.raises(InvalidSampleError, match=r"^envs\[1\]\.frame: expected uint8 \[40, 56, 3\], as the episode's"):
+        episodes[1].keep(video(0, 1, (8, 8))[0])
+    assert [episode.step for episode in episodes] == [0, 0, 0]
+    assert [score.step for score in added(client, episodes, frames)] == [1, 1, 1]
 
 
 def test_an_episode_keeps_its_client(engines: EngineServer) -> None:
@@ -343,11 +304,10 @@ def test_frames_are_resized_as_the_served_checkpoint_reads_them_by_now() -> None
 
 def test_large_frames_go_in_several_requests(transport: Recording, client: RewardClient) -> None:
     large = video(116, 5, (700, 700))  # 1.5 MB each
-    episodes = client.episodes(5, TASK, frames=2)
-    scores = episodes.add(large)
+    scores = added(client, [client.episode(TASK, frames=2) for _ in range(5)], large)
     assert sorted(len(inputs["num_frames"]) for inputs in transport.requests) == [1, 2, 2]
     expected = [offline(client, large[[index]], Sampling("rint_pad", 2)).progress[0] for index in range(5)]
-    np.testing.assert_allclose(scores.progress, expected, atol=TOLERANCE)
+    np.testing.assert_allclose([score.progress for score in scores], expected, atol=TOLERANCE)
     assert transport.most_bytes < 4 * 2**20
 
 

@@ -42,7 +42,7 @@ def test_demo_score_episode_and_labels_agree_on_a_clip_of_the_demo(engines: Engi
             stepped = [episode.add(frame).progress for frame in trajectory.frames]
         report = label(open_dataset(video.parent), ClientScorer(client), LabelOptions())
     labelled = parquet.read_table(report.files[0])["progress_sparse"].to_numpy()
-    shown = invoke("score", video, "--task", TASK, "--url", engines.url, "--json")
+    shown = invoke("score", video, "--task", TASK, "--url", engines.url, "--json", "-")
     (scored,) = json.loads(shown.stdout)["videos"]
     assert expected[-1] > 0.95
     for each in (curve, stepped, labelled, scored["progress"]):

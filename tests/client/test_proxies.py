@@ -13,6 +13,7 @@ from engine_server import EngineServer
 from proxies import HttpProxy, Proxy
 from rfm_client import DeadlineExceededError, RewardClient
 from rfm_client.contract.addresses import grpc_proxy
+from rfm_client.contract.triton import unreachable
 from rfm_client.serving import ServerStatus
 from servers import Endpoints
 
@@ -63,21 +64,26 @@ def test_an_error_names_the_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("grpc_proxy", DEAD)
     for command in ("sample", "status"):
         message = invoke(command, "--url", "grpc://192.0.2.1:8001").stderr
-        assert f"no connection through grpc_proxy={SHOWN}: " in message
-        assert "unset that variable, or add the server's host to no_proxy" in message
+        assert f"192.0.2.1:8001 through grpc_proxy={SHOWN}: no connection: " in message
+        assert "add the host to no_proxy, unless this proxy leads to it" in message
         assert "secret" not in message
+    monkeypatch.setenv("no_proxy", "192.0.2.0/24")
+    assert "proxy" not in str(unreachable("grpc://192.0.2.1:8001", "Connection refused"))
 
 
-def test_an_error_names_a_proxy_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_names_a_proxy_that_does_not_answer(engines: EngineServer, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         value = f"http://127.0.0.1:{silent.getsockname()[1]}"
         monkeypatch.setenv("http_proxy", value)
-        with (
-            RewardClient("grpc://192.0.2.1:8001", timeout_s=0.5) as client,
-            pytest.raises(DeadlineExceededError) as late,
-        ):
+        url = "grpc://192.0.2.1:8001"
+        late = f"^{url} through http_proxy={value}: no answer within 0.5 s$"
+        with RewardClient(url, timeout_s=0.5) as client, pytest.raises(DeadlineExceededError, match=late):
             client.model_info()
-    assert str(late.value) == f"grpc://192.0.2.1:8001 through http_proxy={value}: no answer within 0.5 s"
+        with pytest.raises(DeadlineExceededError, match=late):
+            ServerStatus.read(url, timeout_s=0.5)
+        monkeypatch.setenv("http_proxy", DEAD)
+        error = ServerStatus.read(engines.url, metrics_url="http://192.0.2.1:8002/metrics").metrics_error
+        assert f"(through http_proxy={SHOWN})" in str(error)
 
 
 EXCEPTED = {
@@ -99,7 +105,8 @@ def test_which_proxy_grpc_takes(
     """Also ask gRPC itself, which asks its proxy for the host."""
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    assert grpc_proxy("server.lab:8001") == expected
+    assert grpc_proxy("grpc://server.lab:8001") == expected
+    assert grpc_proxy("grpc://localhost:8001") is grpc_proxy("http://server.lab:8000") is None
     for name, value in environment.items():
         if value and "no_" not in name:
             monkeypatch.setenv(name, proxy.url)
@@ -115,4 +122,4 @@ def test_ipv6_addresses_are_reached(demo_server: Endpoints) -> None:
         status = ServerStatus.read(url)
         assert (status.ready, status.metrics_url) == (True, "http://[::1]:8002/metrics")
         message = invoke("sample", "--url", other).stderr
-        assert f"use {url}" in message
+        assert "use grpc:// for its gRPC port" in message

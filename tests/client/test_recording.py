@@ -60,12 +60,12 @@ def test_score_records_frames_and_curves_on_one_timeline(engines: EngineServer, 
 def test_a_score_that_is_not_predicted_has_no_curve_and_nothing_makes_no_file(tmp_path: Path) -> None:
     told = FrameScores(progress=np.float32([0.25, 0.5]), success=np.full(2, np.nan, np.float32))
     with Recording(tmp_path / "one.rrd") as recording:
-        recording.add(("a/b",), told, {"front": np.zeros((2, 8, 8, 3), np.uint8)})
-        recording.add(("timed",), told, {}, np.array([0.5, 1.5]))
-        recording.add(("untimed",), told, {})
+        recording.add("a/b", told, np.zeros((2, 8, 8, 3), np.uint8))
+        recording.add("timed", told, None, np.array([0.5, 1.5]))
+        recording.add("untimed", told)
     file = tmp_path / "one.rrd"
     found = {entity for entity in entities(file) if "__" not in entity}
-    assert found == {r"/a\/b/progress", r"/a\/b/image/front", "/timed/progress", "/untimed/progress"}
+    assert found == {r"/a\/b/progress", r"/a\/b/image", "/timed/progress", "/untimed/progress"}
     assert logged(file, "video_time", "/timed/progress", "Scalar") == ([500_000_000, 1_500_000_000], [0.25, 0.5])
     assert logged(file, "video_time", "/untimed/progress", "Scalar") == ([], [])
     assert logged(file, "frame", "/untimed/progress", "Scalar") == ([0, 1], [0.25, 0.5])

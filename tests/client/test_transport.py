@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import grpc
 import numpy as np
@@ -36,10 +36,13 @@ from trajectories import random_trajectory
 
 TIMEOUT_S = 1.0
 WITHIN_S = 30.0
-NO_JSON = b"HTTP/1.1 200 OK\r\nContent-Type: text/html\r\nContent-Length: 9\r\n\r\n<html></>"
-NO_ANSWER = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: 2\r\n\r\n{}"
+CLOSING = b"Connection: close\r\n"  # otherwise a caller may send its next request over a connection that just ended
+NO_JSON = b"HTTP/1.1 200 OK\r\n" + CLOSING + b"Content-Type: text/html\r\nContent-Length: 9\r\n\r\n<html></>"
+NO_ANSWER = b"HTTP/1.1 200 OK\r\n" + CLOSING + b"Content-Type: application/json\r\nContent-Length: 2\r\n\r\n{}"
 BAD_GATEWAY = (
-    b"HTTP/1.1 502 Bad Gateway\r\nContent-Type: text/html\r\nContent-Length: 24\r\n\r\n<h1>502 Bad Gateway</h1>"
+    b"HTTP/1.1 502 Bad Gateway\r\n"
+    + CLOSING
+    + b"Content-Type: text/html\r\nContent-Length: 24\r\n\r\n<h1>502 Bad Gateway</h1>"
 )
 NO_HTTP = b"220 smtp ready\r\n"
 
@@ -62,9 +65,9 @@ def listening(answer: Callable[[socket.socket], None]) -> Iterator[int]:
 
 
 def silent(connection: socket.socket) -> None:
-    while connection.recv(65536):
-        continue
-    connection.close()
+    with connection, suppress(ConnectionResetError):
+        while connection.recv(65536):
+            continue
 
 
 def saying(content: bytes) -> Callable[[socket.socket], None]:
@@ -108,11 +111,29 @@ def test_whatever_answers_the_error_is_ours(
     assert caught.value.may_have_ended_server is may_have_ended
 
 
+@pytest.mark.parametrize("refusal", ["403 Forbidden", "404 Not Found"])
+def test_over_http_a_server_that_refuses_its_metadata_is_ready(refusal: str) -> None:
+    """As ``--http-restricted-api`` of Triton does, and proxies that let only some paths through."""
+    asked: list[bytes] = []
+
+    def answer(connection: socket.socket) -> None:
+        with connection, suppress(ConnectionResetError):
+            while head := connection.recv(65536):
+                asked.append(head.split()[1])
+                status = "200 OK" if asked[-1].endswith(b"/ready") else refusal
+                connection.sendall(f"HTTP/1.1 {status}\r\nContent-Length: 0\r\n\r\n".encode())
+
+    with listening(answer) as port, RewardClient(f"http://127.0.0.1:{port}", model="rfm") as client:
+        assert client.is_ready()
+        assert client.is_ready()
+    assert asked.count(b"/v2") <= 2  # one for each of the model's two names
+
+
 def test_a_redirect_is_an_error_and_never_followed() -> None:
     """It would carry frames and headers to an unknown server."""
     arrived: list[socket.socket] = []
     with listening(arrived.append) as other:
-        head = "HTTP/1.1 307 Temporary Redirect\r\nLocation: {}\r\nContent-Length: 0\r\n\r\n"
+        head = "HTTP/1.1 307 Temporary Redirect\r\nConnection: close\r\nLocation: {}\r\nContent-Length: 0\r\n\r\n"
         with listening(saying(head.format(f"http://127.0.0.1:{other}/v2").encode())) as port:
             url = f"http://127.0.0.1:{port}"
             told = (
@@ -142,6 +163,9 @@ def test_a_request_over_two_gib_is_refused_before_it_is_copied() -> None:
         "(subsample, or --fps for videos), or share memory with a server on this host (shared_memory)"
     )
     check_size({"frames": frames}, {"frames"})  # which go through shared memory
+    texts = np.full(2**15, b"x" * 2**16, object)  # 2 GiB, all the same text
+    with pytest.raises(InvalidSampleError, match=r"^task: expected at most 2\.15 GB in a request, got 2\.15 GB"):
+        check_size({"task": texts}, ())
 
 
 @contextmanager

@@ -4,16 +4,10 @@
 from __future__ import annotations
 
 import hashlib
-import re
-import socket
 import subprocess
 import tracemalloc
-from collections.abc import Iterator
-from contextlib import contextmanager
 from fractions import Fraction
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import av
 import numpy as np
@@ -25,7 +19,6 @@ from pictures import TOP, numbered, numbers, write_video
 from rfm_client import InvalidSampleError, load_trajectory
 from rfm_client.frames import frame_times_s, read_video
 from rfm_client.frames.video_decoding import Upright
-from servers import FolderRequest, web_server
 
 
 def test_a_video_is_read_whole_or_at_a_frame_rate(video: Path) -> None:
@@ -81,70 +74,20 @@ def test_a_sound_is_no_video(tmp_path: Path) -> None:
     assert str(refused.value) == f"video: expected a file with a video stream, got none ({tmp_path / 'sound.mp4'})"
 
 
-class FileRequest(FolderRequest):
-    """Serves the files of a folder and records the paths; ``/short/...`` ends early."""
-
-    def __init__(self, asked: list[str], *connection: Any, **options: Any) -> None:
-        self.asked = asked
-        super().__init__(*connection, **options)
-
-    def do_GET(self) -> None:  # noqa: N802  the base class's name
-        self.asked.append(self.path)
-        file = Path(self.directory, Path(self.path.partition("?")[0]).name)
-        if not file.exists():
-            self.send_error(404)
-            return
-        content = file.read_bytes()
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(content)))
-        self.end_headers()
-        self.wfile.write(content[:-9] if self.path.startswith("/short/") else content)
+def test_a_text_is_no_video(tmp_path: Path) -> None:
+    (tmp_path / "text.mp4").write_text("no video")
+    with pytest.raises(InvalidSampleError) as refused:
+        read_video(tmp_path / "text.mp4")
+    expected = "expected a file with a video stream, got a file of another kind, or a damaged one"
+    assert str(refused.value) == f"video: {expected} ({tmp_path / 'text.mp4'})"
 
 
-@contextmanager
-def serving(folder: Path) -> Iterator[tuple[str, list[str]]]:
-    """Serve the folder's files. Yields the URL and the requested paths."""
-    asked: list[str] = []
-    with web_server(partial(FileRequest, asked, directory=str(folder))) as url:
-        yield url, asked
-
-
-def test_a_url_is_downloaded_once_and_read_as_the_file_is(video: Path) -> None:
-    with serving(video.parent) as (url, asked):
-        loaded = load_trajectory(f"{url}/clip.mp4?token=3", task=clip.TASK, fps=3)
-        assert asked == ["/clip.mp4?token=3"]
-    np.testing.assert_array_equal(loaded.positions, read_video(video, 3))
-
-
-BAD_URLS = {
-    "not there": ("nothing.mp4", "HTTP Error 404: Not Found"),
-    "broken off": ("short/clip.mp4", "[0-9]+ of [0-9]+ bytes came"),
-    "no video": ("text.mp4", "a file of another kind, or a damaged one"),
-}
-
-
-@pytest.mark.parametrize(("path", "reason"), BAD_URLS.values(), ids=BAD_URLS)
-def test_the_error_for_a_url_that_fails_has_the_reason(video: Path, path: str, reason: str) -> None:
-    (video.parent / "text.mp4").write_text("no video")
-    with serving(video.parent) as (url, _), pytest.raises(InvalidSampleError) as refused:
-        load_trajectory(f"{url}/{path}")
-    expected = f"video: expected a file with a video stream, got {reason} "
-    assert re.fullmatch(expected + re.escape(f"({url}/{path})"), str(refused.value))
-
-
-def test_a_server_that_says_nothing_is_given_up() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as silent:
-        url = f"http://127.0.0.1:{silent.getsockname()[1]}/clip.mp4"
-        with pytest.raises(InvalidSampleError, match=r"^video: expected .*, got timed out \(http://.*\)$"):
-            read_video(url, 3, timeout_s=0.1)
-    with pytest.raises(InvalidSampleError, match=r"^video: expected .*, got .*Connection refused.* \(http://.*\)$"):
-        read_video(url, 3)
-
-
-@pytest.mark.parametrize("url", ["http://", "http://localhost:none/", "https://lücke/\n"])
-def test_a_url_that_is_none_is_refused(url: str) -> None:
-    with pytest.raises(InvalidSampleError, match=r"^video: expected a file with a video stream, got "):
-        read_video(url, 3)
+@pytest.mark.parametrize("url", ["http://host/clip.mp4?a=b", "https://host/clip.npy"])
+def test_a_url_is_to_be_downloaded_first(url: str) -> None:
+    with pytest.raises(InvalidSampleError) as refused:
+        load_trajectory(url)
+    told = "video: expected a video file, got a URL; download it first: curl -LO URL"
+    assert str(refused.value) == f"{told} ({url})"
 
 
 V30_VIDEO = f"videos/{TOP}/chunk-000/file-000.mp4"
@@ -205,17 +148,6 @@ def test_a_part_counts_from_the_first_frame_wherever_the_time_stamps_begin(
     np.testing.assert_allclose(frame_times_s(file, 20), np.arange(20) / 10, atol=1e-3)
     with pytest.raises(InvalidSampleError, match=r"got 2\.0 to None of 1\.9 s"):
         read_video(file, start_s=2.0)
-
-
-@pytest.mark.parametrize("camera", [TOP, TOP.replace(".", "%2E")])
-def test_a_lerobot_v3_file_behind_a_url_is_refused_and_not_downloaded(camera: str) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        server.setblocking(False)
-        url = f"http://127.0.0.1:{server.getsockname()[1]}/toy/resolve/main/videos/{camera}/chunk-000/file-000.mp4?a=b"
-        with pytest.raises(InvalidSampleError, match=ONE_EPISODE):
-            load_trajectory(url)
-        with pytest.raises(BlockingIOError):
-            server.accept()
 
 
 WIDTH, HEIGHT = 128, 96

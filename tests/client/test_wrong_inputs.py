@@ -19,8 +19,8 @@ from paths import ROOT
 from servers import Endpoints
 
 NOBODY = "grpc://localhost:1"  # where no server listens
-STARTED = "start the server there (rfm serve), or give the URL of one that runs"
-URL = "expected grpc://host:port or http://host:port, or grpcs:// or https://, got"
+STARTED = "start the server there (rfm serve), or give the URL of one that runs (with TLS: grpcs:// or https://)"
+URL = "expected grpc://host:port or http://host:port, or grpcs:// or https:// (brackets around an IPv6 address), got"
 DATASET = (
     "expected a LeRobot dataset (meta/info.json), an RLDS dataset (features.json), an HDF5 file (.hdf5, .h5), a folder "
     "of videos, of folders of pictures or of .npy and .npz files with tasks.csv, or a Hub id "
@@ -82,12 +82,8 @@ USAGE = {
         "Invalid value: --metrics-url needs a single --url"
     ),
     "rfm-client compare a.mp4": "Invalid value for VIDEO: expected at least 2 videos, got 1",
-    "rfm-client sample --num-frames 8-4": bad(
-        "--num-frames", "expected a length (8), several (4,8,16) or a range (4-16), got '8-4'"
-    ),
-    "rfm-client --task x score a.mp4": (
-        "No such option: --task: it stands after the command, as in rfm-client score --task"
-    ),
+    "rfm-client sample --num-frames 8-4": bad("--num-frames", "expected a whole number, got '8-4'"),
+    "rfm-client --task x score a.mp4": "No such option: --task",
     "rfm-client serve my_models": "No such command 'serve': that is `rfm serve`",
     f"rfm-client gateway --triton {NOBODY} --metrics-url nope": bad(
         "--metrics-url", "expected http://host:port/metrics, got 'nope'"
@@ -131,10 +127,10 @@ FAILURES = {
         "(expected the node content, but found '<stream end>')",
     ),
     "rfm export nope --repository out": (1, f"{SOURCE} 'nope'"),
-    "rfm export file.txt --repository out": (1, f"{SOURCE} the file file.txt"),
+    "rfm export file.txt --repository out": (1, f"{SOURCE} the file file.txt; name its folder, ."),
     "rfm export empty --repository out --name 'a b'": (1, "--name: expected letters, digits, _ and -, got 'a b'"),
     f"rfm models list --url {NOBODY}": (1, f"{NOBODY}: no connection: Connection refused: {STARTED}"),
-    "rfm try nope.mp4 --task x": (1, "video: expected a video file, got no file of this name (nope.mp4)"),
+    "rfm try nope.mp4 --task x": (1, "video: expected a video file, got none (nope.mp4)"),
 }
 
 NO_TASK = 'task: expected a sentence with frames, got none: add --task "SENTENCE"'

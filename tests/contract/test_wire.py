@@ -24,7 +24,8 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.contract import BatchTiming, wire
+from rfm_client.contract import wire
+from rfm_client.contract.results import BatchTiming
 from rfm_client.contract.samples import EncoderSample
 
 OF_SOME = [name for name, score in FRAME_SCORES.items() if score.asked != "always" and not score.is_per_bin]

@@ -221,7 +221,6 @@ def test_every_setting_of_a_gateway_is_an_option_of_serve(started: Any, tmp_path
         "api_key_file": str(tmp_path / "key.txt"),
         "cors_origin": "http://lab.example",
         "allow_host": "robot.lab.example",
-        "allow_folder": str(tmp_path),
         "timeout_s": "90.0",
         "max_body_mib": "1",
         "max_in_flight": "3",
@@ -238,9 +237,7 @@ def test_every_setting_of_a_gateway_is_an_option_of_serve(started: Any, tmp_path
     assert started(*words, "--gateway-refuse-blank") == {**options, "--viewer": [], "--refuse-blank": []}
 
 
-@pytest.mark.parametrize(
-    "name", ["certificate", "triton-ca-file", "triton-certificate", "api-key-file", "allow-folder", "dataset"]
-)
+@pytest.mark.parametrize("name", ["certificate", "triton-ca-file", "triton-certificate", "api-key-file", "dataset"])
 def test_a_gateway_that_would_not_start_is_refused_before_triton_starts(name: str, port: int) -> None:
     other = {"certificate": "key", "triton-certificate": "triton-key"}.get(name)
     words = [f"--gateway-{each}=nowhere" for each in (name, other) if each]

@@ -25,7 +25,7 @@ from rfm.families.rewind.checkpoint import RewindCheckpoint
 from rfm.files import CheckpointError
 from rfm_client.contract.description import Origin
 from rfm_export import ExportDiffersError, ExportError
-from rfm_export.source import origin_of, read_source
+from rfm_export.source import read_for_export
 from spoilt import WEIGHTS
 
 EMBEDDINGS = goldens.config("c1_t1_disc10")
@@ -157,7 +157,7 @@ def test_an_export_notes_settings_of_the_run_that_change_the_meaning_of_scores(
     run[section][key] = value
     (checkpoint / "config.yaml").write_text(yaml.safe_dump(run))
     said: list[str] = []
-    read_source(checkpoint, serve_config(EMBEDDINGS), None, said.append)
+    read_for_export(checkpoint, serve_config(EMBEDDINGS), None, None, said.append, other_machine=True)
     shown = json.dumps(value).strip('"')
     told = [of_run(checkpoint), *([f"config.yaml: {setting} is {shown}: {expected}"] if expected else [])]
     assert len(said) == len(told)
@@ -169,11 +169,13 @@ def test_an_export_notes_settings_of_the_run_that_change_the_meaning_of_scores(
 def test_an_export_says_which_config_yaml_it_took(exported: Path) -> None:
     said: list[str] = []
     for config in (FRAMES, EMBEDDINGS):
-        read_source(config.checkpoint, serve_config(config), None, said.append)
+        read_for_export(config.checkpoint, serve_config(config), None, None, said.append, other_machine=True)
     assert said[0] == of_run(FRAMES.checkpoint)
     assert of_run(EMBEDDINGS.checkpoint.parent) in said
     again: list[str] = []
-    read_source(exported / "rfm" / "1" / "checkpoint", serve_config(EMBEDDINGS), None, again.append)
+    read_for_export(
+        exported / "rfm" / "1" / "checkpoint", serve_config(EMBEDDINGS), None, None, again.append, other_machine=True
+    )
     assert again == []  # an export of an export knows of no run
 
 
@@ -202,11 +204,11 @@ def test_a_link_out_of_a_checkpoint_is_refused_and_those_of_the_hub_s_cache_are_
     shutil.copytree(SMALL.checkpoint, blobs)
     for file in blobs.iterdir():
         (snapshot / file.name).symlink_to(Path("..", "..", "blobs", file.name))
-    read_source(snapshot, serve_config(SMALL), None, print)
+    read_for_export(snapshot, serve_config(SMALL), None, None, print, other_machine=True)
     (snapshot / WEIGHTS).unlink()
     (snapshot / WEIGHTS).symlink_to(SMALL.checkpoint / WEIGHTS)
     with pytest.raises(CheckpointError, match=rf"{WEIGHTS}: expected a file of the checkpoint, got a link to /"):
-        read_source(snapshot, serve_config(SMALL), None, print)
+        read_for_export(snapshot, serve_config(SMALL), None, None, print, other_machine=True)
 
 
 def test_models_tell_their_weights_by_the_files_digest(exported: Path) -> None:
@@ -261,11 +263,11 @@ def test_a_set_size_of_batches_wins_also_in_the_check(tmp_path: Path) -> None:
 
 def test_the_origin_of_a_checkpoint_of_the_hub_has_its_commit(tmp_path: Path) -> None:
     snapshot = tmp_path / "models--org--name" / "snapshots" / "0123abcd"
-    assert origin_of("org/name@best", snapshot, "") == Origin(
+    assert published.origin_of("org/name@best", snapshot, "") == Origin(
         source="org/name@best", revision="0123abcd", computation=""
     )
     snapshot.mkdir(parents=True)
-    assert origin_of(snapshot, snapshot, "") == Origin(source="org/name@0123abcd", computation="")
+    assert published.origin_of(snapshot, snapshot, "") == Origin(source="org/name@0123abcd", computation="")
 
 
 def test_the_configuration_of_the_training_run_is_kept_without_its_secrets(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from rfm_client.contract import wire
 from rfm_export import ExportError
 from rfm_export.layout import Version, generated_models
 from rfm_export.pbtxt import render
-from rfm_export.source import Source, read_for_export, read_source, saturating_samples, with_batch_size
+from rfm_export.source import Source, read_for_export, saturating_samples, with_batch_size
 from vlm import BFLOAT16, load
 
 EMBEDDINGS, FRAMES, VLM = (goldens.config(name) for name in ("c1_t1_disc10", "enc_c1_t1_disc10", "q3_tok_disc10"))
@@ -35,7 +35,7 @@ def ignore(line: str) -> None:
 @functools.cache
 def source(name: str) -> Source:
     config = goldens.config(name)
-    return read_source(config.checkpoint, serve_config(config), None, ignore)
+    return read_for_export(config.checkpoint, serve_config(config), None, None, ignore, other_machine=True)
 
 
 def models(config: goldens.Config, **changes: Any) -> dict[str, pb.ModelConfig]:

@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 import torch
@@ -19,7 +22,6 @@ import goldens
 from paths import GOLDEN
 from rfm import published
 from rfm.files import CheckpointError
-from rfm.published.lora import Scaling
 from spoilt import Spoil, beside, both, in_yaml, renamed, run_settings, settings, weights, with_sources
 from vlm import PLAIN, load
 
@@ -100,9 +102,16 @@ def with_lora_of_the_language_head(folder: Path) -> None:
     weights(lambda tensors: tensors.update(more))(folder)
 
 
+def in_the_newest_form(folder: Path) -> None:
+    """Fields that no PEFT of this environment knows, without effect."""
+    unset = {"velora_2": None, "later_config": {}, "later_pattern": [], "use_later": False}
+    settings(CONFIG, **unset, peft_version="9.0", ensure_weight_tying=True)(folder)
+
+
 PLAIN_LORA = [name for name in WRITTEN if name.startswith("LoRA")]
 SAME: dict[str, tuple[str, Spoil]] = {
     **{name: (ADAPTER, written(name)) for name in PLAIN_LORA},
+    "with fields of another PEFT": (ADAPTER, in_the_newest_form),
     "PiSSA converted to LoRA": (ADAPTER, both(in_adapter(factors_twice), written("PiSSA converted to LoRA"))),
     "around the language model": (ADAPTER, renamed(r"^base_model\.model\.language_model\.", "base_model.model.", FACTORS)),
     "around the whole model": (LORA_INSIDE, renamed(r"^model\.language_model\.base_model\.model\.", "model.base_model.model.language_model.")),
@@ -159,11 +168,35 @@ def test_updates_too_small_for_bfloat16_are_not_lost(tmp_path: Path) -> None:
     assert len(modules) == 14
 
 
-def test_factors_in_bfloat16_are_scaled_in_float32() -> None:
-    factors = {"A": torch.ones(3, 4).bfloat16(), "B": torch.randn(5, 3, generator=torch.manual_seed(0)).bfloat16()}
-    tensors = {f"layer.lora_{side}.weight": factor for side, factor in factors.items()}
-    scaled = Scaling(Path(CONFIG), 3, 1.0).scaled(tensors)
-    torch.testing.assert_close(scaled["layer.lora_B.weight"], factors["B"].float() / 3, rtol=1e-6, atol=0)
+def test_factors_in_bfloat16_are_scaled_in_float32(tmp_path: Path) -> None:
+    folder, options = with_sources(ADAPTER, tmp_path)
+    in_adapter(
+        lambda tensors: tensors.update({name: each.bfloat16() for name, each in tensors.items() if ".lora_" in name})
+    )(folder)
+    settings(CONFIG, lora_alpha=1.2)(folder)
+    (name,) = [
+        name
+        for name in load_file(folder / FACTORS)
+        if re.search(r"text|language_model.layers.1.self_attn.q_proj.lora_B", name)
+    ]
+    written = load_file(folder / FACTORS)[name]
+    read = load(ADAPTER, folder, options["base_model"]).factors[
+        "model.language_model.layers.1.self_attn.q_proj.lora_B.weight"
+    ]
+    torch.testing.assert_close(read, 1.2 / 4 * written.float(), rtol=1e-6, atol=0)
+
+
+def test_the_scaling_of_each_module_is_peft_s(tmp_path: Path) -> None:
+    built = []
+    for name in ("LoRA", "rsLoRA", "alphas of modules"):
+        folder, options = with_sources(ADAPTER, tmp_path / name)
+        written(name)(folder)
+        built.append(load(ADAPTER, folder, options["base_model"]).factors)
+    plain, root, alphas = built
+    for name, factor in plain.items():
+        is_b = "lora_B" in name
+        torch.testing.assert_close(root[name], factor * (2 if is_b else 1), rtol=1e-6, atol=0)  # 8 / sqrt(4), not 8 / 4
+        torch.testing.assert_close(alphas[name], factor * (2 if is_b and "q_proj" in name else 1), rtol=1e-6, atol=0)
 
 
 KINDS = "q_proj|k_proj|v_proj|o_proj|gate_proj|up_proj|down_proj"
@@ -223,7 +256,7 @@ def with_the_embedding_twice(tensors: Tensors) -> None:
 def widen(tensors: Tensors) -> None:
     """Make a product that would take terabytes."""
     name = next(name for name in tensors if ".lora_A." in name)
-    tensors |= {name: torch.zeros(1, 2**20), name.replace("lora_A", "lora_B"): torch.zeros(2**20, 1)}
+    tensors |= {name: torch.zeros(4, 2**20), name.replace("lora_A", "lora_B"): torch.zeros(2**20, 4)}
 
 
 def of_another_rank(tensors: Tensors) -> None:
@@ -245,15 +278,12 @@ REFUSED: dict[str, tuple[str, Spoil, str]] = {
     **{
         name: (ADAPTER, written(name), rf"adapter_config\.json: {message}{MERGE}")
         for name, message in {
-            "rsLoRA": r"expected plain LoRA, got use_rslora",
             "DoRA": r"expected plain LoRA, got use_dora",
             "PiSSA": r"init_lora_weights: expected true, got 'pissa', which may change the base model's weights before",
             "PiSSA by iteration": r"init_lora_weights: expected true, got 'pissa_niter_4'",
             "OLoRA": r"init_lora_weights: expected true, got 'olora'",
             "EVA": r"expected plain LoRA, got eva_config",
             "MiCA": r"init_lora_weights: expected true, got 'mica'",
-            "ranks of modules": r"expected plain LoRA, got rank_pattern",
-            "alphas of modules": r"expected plain LoRA, got alpha_pattern",
             "biases of all": r"bias: expected none, got 'all', which PEFT does not always save",
             "biases of factors": r"expected plain LoRA, got lora_bias",
             "aLoRA": r"expected plain LoRA, got alora_invocation_tokens",
@@ -265,8 +295,8 @@ REFUSED: dict[str, tuple[str, Spoil, str]] = {
     "no LoRA": (ADAPTER, settings(CONFIG, peft_type="IA3", r=None), r"peft_type: expected LORA, got 'IA3'"),
     "an embedding": (ADAPTER, in_adapter(of_the_embedding), rf"{LINEAR}'model\.language_model\.embed_tokens\.lora_embedding_A'{MERGE}"),
     "an embedding saved in two ways": (ADAPTER, in_adapter(with_the_embedding_twice), rf"{LINEAR}'model\.language_model\.embed_tokens\."),
-    "a convolution": (ADAPTER, in_adapter(of_a_convolution), r"patch_embed\.proj: expected LoRA factors of \[.*\], got \[32, 4, 1, 1, 1\] and"),
-    "a huge product": (ADAPTER, in_adapter(widen), r"expected LoRA factors of \[\d+, \d+\], got \[1048576, 1\] and \[1, 1048576\]"),
+    "a convolution": (ADAPTER, in_adapter(of_a_convolution), r"expected the modules with LoRA factors, got a configuration without \['model\.visual\.patch_embed\.proj'\]"),
+    "a huge product": (ADAPTER, in_adapter(widen), r"expected LoRA factors of \[\d+, \d+\], got \[1048576, 4\] and \[4, 1048576\]"),
     "lost: a module": (ADAPTER, lost(r"layers\.1\.self_attn\.q_proj"), rf"adapter_config\.json: {LOST}'{Q_PROJ.format(1)}'\]: these modules would"),
     "lost: a kind of module": (ADAPTER, lost("q_proj"), rf"{LOST}'{Q_PROJ.format(0)}', '{Q_PROJ.format(1)}'\]"),
     "lost: the vision tower": (ADAPTER, lost("visual"), rf"{LOST}'model.visual.blocks.0.mlp.down_proj', "),
@@ -274,7 +304,7 @@ REFUSED: dict[str, tuple[str, Spoil, str]] = {
     "lost: a layer of those chosen": (ADAPTER, lost(r"\.1\.", layers_to_transform=[0, 1]), rf"{LOST}'{Q_PROJ.format(1)}'"),
     "lost: a module of a pattern": (ADAPTER, lost(r"visual|layers\.0.*q_proj", target_modules=OF_TEXT), rf"{LOST}'{Q_PROJ.format(0)}'\]"),
     "lost: linear layers": (ADAPTER, lost("^$", target_modules="all-linear"), rf"{LOST}'model.visual.blocks.0.attn.proj', "),
-    "lost: a layer, if no module is named": (ADAPTER, lost(r"layers\.1\.self_attn\.q_proj", target_modules=None), rf"{LOST}'{Q_PROJ.format(1)}'\]"),
+    "no module is named": (ADAPTER, settings(CONFIG, target_modules=None), r"expected a configuration that PEFT applies, got ValueError: Please specify"),
     "lost: a module saved whole": (ADAPTER, settings(CONFIG, modules_to_save=["merger"]), r"modules_to_save: expected the weights of each module, got none for \['model\.visual\.merger\.ln_q\.weight'"),
     "lost: factors among whole weights": (LORA_INSIDE, lost(r"layers\.1\.mlp\.up_proj", "model.safetensors"), rf"model\.safetensors: {LOST}layers\.1\.mlp"),
     "lost: all factors among whole weights": (LORA_INSIDE, lost("", "model.safetensors"), rf"model\.safetensors: {LOST}layers\.1\.mlp"),
@@ -283,7 +313,22 @@ REFUSED: dict[str, tuple[str, Spoil, str]] = {
     "factors of two ranks": (LORA_INSIDE, weights(first("lora_B", lambda b: b[:, :-1])), r"expected LoRA factors of one rank, got \[\d+, 3\] and \[4, \d+\]"),
     "a run of another rank": (LORA_INSIDE, run_settings("peft", r=32), r"config\.yaml: r: expected 4, the rows of .*lora_A, got 32; put in r"),
     "a module of another rank": (LORA_INSIDE, weights(of_another_rank), r"r: expected 8, the rows of model\.language_model\.layers\.1\.mlp\.up_proj\.lora_A, got 4"),
-    "a run and an adapter that disagree": (LORA_INSIDE, both(beside_its_adapter, settings(CONFIG, lora_alpha=16)), r"adapter_config\.json: expected r 4 and lora_alpha 8, as .*config\.yaml has it, got r 4 and lora_alpha 16"),
+    "a run and an adapter that disagree": (LORA_INSIDE, both(beside_its_adapter, settings(CONFIG, lora_alpha=16)), r"adapter_config\.json: expected r 4 and lora_alpha 8, as .*config\.yaml has it, got r 4 and lora_alpha 16; mend the wrong one"),
+    "a pattern of no module": (ADAPTER, settings(CONFIG, alpha_pattern={"^layers.0": 16}), r"adapter_config\.json: alpha_pattern: expected patterns of modules, got '\^layers\.0', of none; remove it"),
+    **{
+        f"no pattern: {field}": (ADAPTER, settings(CONFIG, **{field: value}), rf"adapter_config\.json: {field}: expected a pattern of names, got '\(q_proj': .*; write the names")
+        for field, value in {"target_modules": "(q_proj", "exclude_modules": "(q_proj", "rank_pattern": {"(q_proj": 4}, "alpha_pattern": {"(q_proj": 4}}.items()
+    },
+    **{
+        f"patterns for names: {field}": (ADAPTER, settings(CONFIG, **{"layers_to_transform": [0], field: [".*"]}), rf"{field}: expected names of modules, got '\.\*'")
+        for field in ("layers_pattern", "modules_to_save")
+    },
+    **{
+        f"alpha: {alpha}": (ADAPTER, settings(CONFIG, lora_alpha=alpha), rf"adapter_config\.json: expected lora_alpha and r of the LoRA weights, got lora_alpha {re.escape(repr(alpha))} and r 4")
+        for alpha in (math.inf, math.nan, True, "8")
+    },
+    "an alpha of a module in words": (ADAPTER, settings(CONFIG, alpha_pattern={"q_proj": "8"}), r"alpha_pattern: expected finite numbers, got '8'"),
+    "a base model of 8 bits": (ADAPTER, beside("base_model", weights(first("q_proj", lambda w: w.to(torch.float8_e4m3fn)))), r"base_model/model\.safetensors: expected a safetensors file, got '.*q_proj.*' of type 'F8_E4M3', which is none of"),
     "an adapter and whole weights": (ADAPTER, empty("model.safetensors"), r"expected an adapter \(adapter_config\.json\) or whole weights \(model\.safetensors\), got both"),
     "whole weights and an adapter without its configuration": (PLAIN, empty(FACTORS), r"expected an adapter \(adapter_model\.safetensors\) or whole weights \(model\.safetensors\), got both"),
     "no embedding": (ADAPTER, in_adapter(first("embed_tokens", None)), r"expected the embedding of the special tokens, got none: their rows .* are lost .*save_embedding_layers=True"),
@@ -301,6 +346,35 @@ def test_an_adapter_that_would_score_otherwise_is_refused(
     spoil(folder)
     with pytest.raises(CheckpointError, match=message):
         load(name, folder, options["base_model"]).build()
+
+
+def test_patterns_are_matched_in_bounded_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, options = with_sources(ADAPTER, tmp_path)
+    settings(CONFIG, target_modules="(a|b|ab)*c")(folder)
+    late = mock.Mock(fullmatch=mock.Mock(side_effect=TimeoutError("regex timed out")))
+    monkeypatch.setattr("regex.compile", lambda pattern: late)
+    expected = r"target_modules: expected a pattern of names, got '\(a\|b\|ab\)\*c': regex timed out; write the names"
+    with pytest.raises(CheckpointError, match=expected):
+        load(ADAPTER, folder, options["base_model"])
+    assert 0 < late.fullmatch.call_args.kwargs["timeout"] <= 5
+
+
+@pytest.mark.parametrize("pattern", ["^layers\\.0\\.mlp", "layers\\.0\\.mlp"])
+def test_patterns_among_whole_weights_begin_where_peft_s_do(tmp_path: Path, pattern: str) -> None:
+    """PEFT wrapped the language model, whose names begin with layers."""
+    folder, _ = with_sources(LORA_INSIDE, tmp_path)
+    beside_its_adapter(folder)
+    settings(CONFIG, alpha_pattern={rf"{pattern}\.\w+": 16, r"\w+_proj": 8})(folder)
+    plain, changed = load(LORA_INSIDE).factors, load(LORA_INSIDE, folder).factors
+    for name, factor in plain.items():
+        times = 2 if "layers.0.mlp" in name and "lora_B" in name else 1
+        torch.testing.assert_close(changed[name], factor * times, rtol=1e-6, atol=0)
+
+
+def test_a_missing_package_of_peft_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "peft", None)
+    with pytest.raises(ImportError, match=r'LoRA needs PEFT: pip install "\.\[vlm\]" \(.*peft'):
+        load(ADAPTER)
 
 
 BASES = {

@@ -147,7 +147,7 @@ from small_network import SMALL
 from trajectories import random_trajectory
 from rfm.engine import Engine
 from rfm.engine import Execution
-from rfm.families.rewind.predictor import RewindPredictor
+from rfm.families.rewind.checkpoint import RewindPredictor
 from rfm.families.rewind.network import RewindTransformer
 from rfm_client import InferenceFailedError, ProgressResult, ProgressSample
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 from dataclasses import replace
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from google.protobuf import text_format
+from safetensors.torch import save_file
 from torch import Tensor, nn
 from tritonclient.grpc import model_config_pb2 as pb
 
@@ -35,7 +35,7 @@ from rfm_client import (
 from rfm_client import SimilaritySample as Similarity
 from rfm_client.contract.samples import blank_trajectory, random_trajectory
 from rfm_commands.engine_scorer import EngineScorer
-from spoilt import convert, without
+from spoilt import without
 from vlm import assert_close
 
 REWIND, VLM = "c1_t1_disc10", "q3_tok_disc10"
@@ -125,17 +125,13 @@ class FirstCode(nn.Module):
 
 @pytest.fixture(scope="module")
 def first_code(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FirstCode]:
-    """A checkpoint as the first training script saves it, converted."""
+    """The weights that the first training script saves, in safetensors."""
     torch.manual_seed(0)
     network = FirstCode(max_length=16)
     for parameter in network.parameters():
         nn.init.normal_(parameter, std=0.3)
-    optimizer = torch.optim.Adam(network.parameters())
-    run = {"epoch": 19, "optimizer_state_dict": optimizer.state_dict()}
-    args = argparse.Namespace(max_length=16, subsample_video=True, lr=1e-4)
     folder = tmp_path_factory.mktemp("run")
-    torch.save({"args": args, "model_state_dict": network.state_dict(), **run}, folder / "rewind_epoch_19.pth")
-    convert(published.load, folder)
+    save_file(network.state_dict(), folder / "model.safetensors")
     return folder, network.eval()
 
 

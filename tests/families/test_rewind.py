@@ -17,8 +17,8 @@ from rfm import published
 from rfm.config import DEFAULT_TOKEN_BUDGET
 from rfm.engine import Engine, Outcome
 from rfm.engine.layers import progress_from_logits
+from rfm.families.rewind.checkpoint import RewindCollator, RewindPredictor
 from rfm.families.rewind.network import Packing, RewindConfig, RewindTransformer, rounded_up
-from rfm.families.rewind.predictor import RewindCollator, RewindPredictor
 from rfm_client import (
     InvalidSampleError,
     PreferenceSample,

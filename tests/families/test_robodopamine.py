@@ -15,7 +15,7 @@ import torch
 
 from rfm import published
 from rfm.engine import Engine, Execution
-from rfm.families.robodopamine.answers import fused, hops, parsed, sampled_frames
+from rfm.families.robodopamine.prompts import fused, hops, parsed, sampled_frames
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, Trajectory
 from robodopamine import ANSWERED, CHECKPOINT, FOLDER, READABLE, Case, case_named
 

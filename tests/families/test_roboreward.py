@@ -19,8 +19,9 @@ from engines import asked_engine
 from reward_models import Reference, references
 from rfm import published
 from rfm.engine import Engine, Execution
-from rfm.families.roboreward.predictor import RoboRewardPredictor
+from rfm.families.roboreward.checkpoint import RoboRewardPredictor
 from rfm.families.roboreward.prompts import as_jpeg, is_unclear, parsed
+from rfm.files import CheckpointError
 from rfm.qwen.backbone import ROOM
 from rfm.qwen.batch import VlmRow
 from rfm.qwen.written import WrittenAnswer
@@ -130,6 +131,13 @@ def test_an_answer_without_a_single_whole_score_is_unclear(answer: str, score: i
 
 def samples_named(name: str) -> list[ProgressSample]:
     return next(case for case in CASES if case.file.stem == name).samples()
+
+
+def test_a_tokenizer_without_a_token_for_a_score_is_refused_with_its_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint: Any = published.load(str(CHECKPOINT), reward_model="roboreward")
+    monkeypatch.setattr("rfm.families.roboreward.checkpoint.SCORES", (1, 2, 4, 3, 5))
+    with pytest.raises(CheckpointError, match=f"^base model {CHECKPOINT}: expected a token for 4, got none"):
+        checkpoint.load_collator()
 
 
 def test_unclear_answers_are_marked_and_counted(engine: Engine) -> None:

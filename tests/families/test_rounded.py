@@ -3,18 +3,22 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import shutil
 import sys
+import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 import goldens
 import rfm_export
@@ -25,9 +29,9 @@ from reward_models import ROOT
 from rfm import published
 from rfm.config import ExportConfig
 from rfm.engine import Engine
-from rfm.published import CheckpointError
-from rfm.published.nf4 import dequantize
-from rfm.qwen.rounded import Int8Linear, Nf4Linear, RoundedLinear, fit, quantize, rounded
+from rfm.published import CheckpointError, rounding
+from rfm.published.rounding import dequantize
+from rfm.qwen.rounded import NF4_CODES, Int8Linear, Nf4Linear, RoundedLinear, fit, rounded
 from rfm_client import ModelInfo, ProgressSample
 from rfm_commands.engine_scorer import EngineScorer
 from rfm_export.errors import ExportError
@@ -120,19 +124,19 @@ def test_int8_takes_the_nearest_of_255_steps_of_each_row() -> None:
 
 
 @pytest.mark.parametrize("shape", [(6, 128), (5, 100), (3, 34), (1, 2)])
-def test_nf4_rounds_and_decodes_as_bitsandbytes(shape: tuple[int, int]) -> None:
+def test_nf4_rounds_to_the_nearest_code_and_decodes_as_bitsandbytes(shape: tuple[int, int]) -> None:
     weight = torch.randn(shape, generator=torch.Generator().manual_seed(1)) * 0.02
-    codes, scales = quantize(weight)
-    from bitsandbytes import functional as bitsandbytes  # a GPU's tests run without it
-
-    theirs, state = bitsandbytes.quantize_4bit(weight, blocksize=64, quant_type="nf4")
-    assert torch.equal(codes.flatten(), theirs.flatten())
-    assert torch.equal(scales, state.absmax)
+    own = rounded("layer.weight", weight, "nf4", torch.float32)
+    blocks = pad(weight.flatten(), (0, -weight.numel() % 64)).view(-1, 64)
+    assert torch.equal(own["layer.scale"], blocks.abs().amax(1))
+    nearest = (blocks[..., None] / own["layer.scale"][:, None, None] - torch.tensor(NF4_CODES)).abs().argmin(-1)
+    nearest = nearest.flatten()[: weight.numel()]
+    assert torch.equal(own["layer.weight"].flatten(), (nearest[0::2] << 4 | nearest[1::2]).to(torch.uint8))
     parts, values = in_nf4("layer.weight", weight)
     assert torch.equal(layer_with(weight, "nf4", torch.bfloat16).values(torch.bfloat16), values)
     assert dequantize(parts) == 1
     assert torch.equal(parts["layer.weight"], values)
-    assert not quantize(torch.zeros(2, 32))[1].any()
+    assert not rounded("layer.weight", torch.zeros(2, 32), "nf4", torch.float32)["layer.scale"].any()
 
 
 @pytest.mark.slow
@@ -258,6 +262,29 @@ def test_a_missing_bitsandbytes_is_named_with_its_remedy(monkeypatch: pytest.Mon
     with pytest.raises(CheckpointError, match=expected):
         published.load(**sources(PLAIN), weights="nf4")
     Engine.of(published.load(**sources(PLAIN), weights="int8"))  # which PyTorch decodes
+
+
+def test_a_checkpoint_that_is_rounded_reads_its_processor_once_and_frees_the_full_weights(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from rfm.families.robometer import checkpoint as robometer
+
+    full: list[weakref.ref[Any]] = []
+
+    def rounded_as_asked(checkpoint: Any, kind: Any) -> Any:
+        full.append(weakref.ref(checkpoint))
+        return rounding.rounded_as_asked(checkpoint, kind)
+
+    processor = mock.Mock(wraps=robometer.read_processor)
+    monkeypatch.setattr(robometer, "read_processor", processor)
+    monkeypatch.setattr(published, "rounded_as_asked", rounded_as_asked)
+    options = sources(PLAIN)
+    loaded = published.read(**options, weights="int8")
+    published.notes(Path(options["source"]), loaded)
+    assert loaded.checkpoint.flop(SAMPLES[0]) > 0
+    gc.collect()
+    assert full[0]() is None
+    assert processor.call_count == 1
 
 
 @pytest.mark.parametrize("part", ["weight", "scale"])

@@ -224,17 +224,17 @@ def test_missing_settings_are_assumed_and_unexpected_keys_are_noted(copied: Path
     loaded = published.read(copied)
     assert loaded.checkpoint.config.attention == "isolated"
     assert [(each.name, each.value) for each in loaded.assumptions] == [("attn_implementation", ISOLATED)]
-    assert loaded.notes() == [
+    assert loaded.notes(loaded.checkpoint) == [
         f"config.json{where}: not expected, and not used: scores may differ from the original's"
         for where in (": 'success_head_config'", ": value_head_config: 'dropout'")
     ]
 
 
 WRONG = {
-    "attention": (lambda c: c.update(attn_implementation="window"), "attn_implementation: expected pred_slot"),
+    "attention": (lambda c: c.update(attn_implementation="window"), "attn_implementation: expected one of pred_slot"),
     "copies": (lambda c: c.update(value_token_repeat=8), "value_token_repeat: expected 8, as in config.json, got 3"),
     "token": (lambda c: c.update(value_token_id=7), "value_token_id: expected 665, the tokenizer's id of <value>"),
-    "head": (lambda c: c["value_head_config"].update(head_type="mlp"), "head_type: expected bro or linear"),
+    "head": (lambda c: c["value_head_config"].update(head_type="mlp"), "head_type: expected one of bro, linear"),
     "width": (
         lambda c: c["value_head_config"].update(hidden_dims=0),
         "hidden_dims: expected a whole number of at least",

@@ -35,12 +35,13 @@ def published_text_encoder(folder: Path) -> None:
     BertConfig(**sizes).save_pretrained(folder)
 
 
-OF_IMAGE, OF_TEXT = (published_image_encoder, usual.image_facts), (published_text_encoder, usual.text_facts)
+OF_IMAGE = (published_image_encoder, usual.image_differences)
+OF_TEXT = (published_text_encoder, usual.text_differences)
 OTHER_ENCODERS: dict[str, tuple[Any, Spoil, list[str]]] = {
     "images as published": (OF_IMAGE, lambda _folder: None, []),
     "registers": (OF_IMAGE, settings("config.json", model_type="dinov2_with_registers"), ["model_type: expected dinov2, got dinov2_with_registers"]),
-    "another crop": (OF_IMAGE, settings("preprocessor_config.json", crop_size={"height": 256, "width": 256}), ["crop_px: expected [224, 224], got [256, 256]"]),
-    "another brightness": (OF_IMAGE, settings("preprocessor_config.json", image_mean=[0.5, 0.456, 0.406]), ["image_mean: expected [0.485, 0.456, 0.406], got [0.5, 0.456, 0.406]"]),
+    "another crop": (OF_IMAGE, settings("preprocessor_config.json", crop_size={"height": 256, "width": 256}), ["crop_px: expected (224, 224), got (256, 256)"]),
+    "another brightness": (OF_IMAGE, settings("preprocessor_config.json", image_mean=[0.5, 0.456, 0.406]), ["mean: expected (0.485, 0.456, 0.406), got (0.5, 0.456, 0.406)"]),
     "another width": (OF_IMAGE, settings("config.json", hidden_size=384, num_attention_heads=6), []),  # as the weights tell
     "texts as published": (OF_TEXT, lambda _folder: None, []),
     "fewer layers": (OF_TEXT, settings("config.json", num_hidden_layers=6), ["num_hidden_layers: expected 12, got 6"]),
@@ -51,10 +52,10 @@ OTHER_ENCODERS: dict[str, tuple[Any, Spoil, list[str]]] = {
 def test_an_encoder_as_wide_as_upstream_s_is_compared(
     tmp_path: Path, encoder: Any, spoil: Spoil, expected: list[str]
 ) -> None:
-    publish, facts = encoder
+    publish, differences = encoder
     publish(tmp_path)
     spoil(tmp_path)
-    assert usual.differences(facts(str(tmp_path))) == expected
+    assert differences(str(tmp_path)) == expected
 
 
 def test_encoders_that_differ_from_upstream_s_are_noted(tmp_path: Path) -> None:
@@ -75,7 +76,7 @@ def test_encoders_that_differ_from_upstream_s_are_noted(tmp_path: Path) -> None:
         f"{image}: differs from upstream's facebook/dinov2-base in num_hidden_layers: expected 12, got 1; "
     )
     assert of_text == (
-        f"{text}: differs from upstream's sentence-transformers/all-MiniLM-L12-v2 in num_hidden_layers: expected 12, got 6; "
-        "vocab_size: expected 30522, got 180: scores are right only if the run's embeddings were made with it"
+        f"{text}: differs from upstream's sentence-transformers/all-MiniLM-L12-v2 in vocab_size: expected 30522, got 180; "
+        "num_hidden_layers: expected 12, got 6: scores are right only if the run's embeddings were made with it"
     )
     assert "--text-encoder; only its width agrees" in assumed

@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import groupby
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -24,10 +25,12 @@ from engines import TRANSFORMERS, load_engine
 from rfm import published
 from rfm.engine import Engine, Execution
 from rfm.engine.layers import Normalisation, progress_from_logits
-from rfm.families.robometer.collator import VlmCollator
-from rfm.families.robometer.predictor import VlmPredictor
+from rfm.families.robometer.checkpoint import VlmPredictor
+from rfm.families.robometer.prompts import VlmCollator
 from rfm.qwen.backbone import embedded
+from rfm.qwen.collator import Chat, QwenCollator
 from rfm.qwen.images import QwenImages, fitted_size
+from rfm.qwen.language import LanguageCollator
 from rfm.qwen.network import QWEN_2_5
 from rfm_client import (
     PreferenceResult,
@@ -415,3 +418,13 @@ def test_a_tokenizer_adds_no_special_tokens_to_the_chat_template_s_text() -> Non
     assert len(tokenizer(end)["input_ids"]) == 3
     (row,) = type(collator)(collator.config, tokenizer, collator.images).rows(sample)
     np.testing.assert_array_equal(row.input_ids, expected.input_ids)
+
+
+@pytest.mark.parametrize(("collator", "count"), [(VlmCollator, 600), (LanguageCollator, 300)])
+def test_few_texts_are_cached_whole_and_many_in_pieces(collator: type[QwenCollator], count: int) -> None:
+    """The tokens of a conversation of 128 frames take a hundred kilobytes, those of a piece hardly any."""
+    tokenizer = mock.Mock(return_value={"input_ids": [1]})
+    chat = Chat(tokenizer, collator.kept_tokens)
+    for task in [*range(300), *range(300)]:
+        chat.tokens(f"task {task}")
+    assert tokenizer.call_count == count

@@ -18,8 +18,8 @@ import rynnvalue
 from engines import asked_engine, load_engine
 from reward_models import ROOT
 from rfm.engine import Engine
+from rfm.families.rewind.checkpoint import RewindPredictor
 from rfm.families.rewind.network import RewindTransformer
-from rfm.families.rewind.predictor import RewindPredictor
 from rfm_client import (
     InvalidSampleError,
     PreferenceSample,

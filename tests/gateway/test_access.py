@@ -220,13 +220,14 @@ def test_a_refusal_is_a_line_with_status_caller_reason_and_request_id(caplog: py
 def test_a_failure_of_triton_is_logged_and_refused_evaluations_are_counted_with_their_id(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    reasons = {"unavailable": {}, "host": {"Host": FOREIGN[0]}, "origin": {"Origin": LAB}}
+    refused = {503: {}, 421: {"Host": FOREIGN[0]}, 403: {"Origin": LAB}}
     with inside() as client:
-        for headers in reasons.values():
+        for headers in refused.values():
             response = client.post("/evaluate_batch", content=SAMPLE, headers={"X-Request-ID": "mine", **headers})
             assert response.headers["X-Request-ID"] == "mine"
-        for reason in reasons:
-            assert f'rfm_gateway_rejections_total{{reason="{reason}"}} 1.0' in client.get("/metrics").text
+        for code in refused:
+            counted = f'rfm_gateway_requests_total{{code="{code}",endpoint="/evaluate_batch"}} 1.0'
+            assert counted in client.get("/metrics").text
     found, *_ = [record.getMessage() for record in caplog.records if record.name == "rfm_gateway.refusals"]
     assert found.startswith("503 POST /evaluate_batch for testclient (testclient): ")
     assert "connect" in found

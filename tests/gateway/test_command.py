@@ -60,8 +60,7 @@ def test_an_open_address_without_a_key_is_warned_of(
 
 NO_KEY = "'--api-key-file': expected a key, here or in RFM_GATEWAY_API_KEY, got no character"
 BAD_OPTIONS = {
-    "--triton localhost:8001": "'--triton': expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
-    "--allow-folder nowhere": "No such file or directory",
+    "--triton localhost:8001": "'--triton': expected grpc://host:port or http://host:port, or grpcs:// or https:// (brackets around an IPv6 address), got",
     "--api-key-file nowhere": "'--api-key-file': expected a text file, got",
     f"--api-key-file {os.devnull}": NO_KEY,
     "--host 192.0.2.1": "Cannot assign requested address; --host names another",

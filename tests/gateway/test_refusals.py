@@ -181,7 +181,7 @@ def but(**fields: Any) -> Json:
 
 
 NUMBERS, EQUAL_ROWS = "expected numbers, got something else", "expected rows of equal length, got unequal ones"
-NO_FILES = r"expected an array \(this gateway reads no files\), got the name of a file"
+NO_FILES = "expected an array, since the gateway reads no files, got names of files"
 NO_TEXT = "expected an embedding, or a task.*, got neither"
 NO_TYPE = "expected progress, preference or similarity, got "
 BAD_ARRAYS: dict[str, dict[str, tuple[Any, str]]] = {
@@ -233,8 +233,12 @@ BAD_SAMPLES: dict[str, tuple[Any, str, str]] = {
     "no text, blank task": (but(text_embedding=None, task=" "), "trajectory text_embedding", NO_TEXT),
     "a task that is a number": (but(task=5), "trajectory task", "expected text, got 5"),
     "no task": (of_frames(BLACK, task=None), "trajectory task", "expected a task sentence with frames, got ''"),
-    "names of images": (of_frames(["0.png", "1.png"]), "trajectory frames 0", NO_FILES),
-    "the name of a file": (progress({"embeddings_path": "a.npz"}), "trajectory embeddings_path", NO_FILES),
+    "names of images": (of_frames(["0.png", "1.png"]), "trajectory frames", NO_FILES),
+    "the name of a file": (
+        progress({"embeddings_path": "a.npz"}),
+        "trajectory embeddings_path",
+        "expected video_embeddings as an array, since the gateway reads no files, got the name of a file",
+    ),
     "no trajectory": ({"sample_type": "progress"}, "trajectory", "expected a value, got none"),
     "no second": ({**preference(FIRST, SECOND), "rejected_trajectory": 5}, "rejected_trajectory", ".*object, got 5"),
     "no type": ({"trajectory": FIRST}, "sample_type", f"{NO_TYPE}None"),

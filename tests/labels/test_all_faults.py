@@ -30,7 +30,7 @@ class Asked(BrightnessScorer):
 
     def run(self, source: Path, labels: LabelOptions, *, dry_run: bool = False, task: str | None = None) -> int:
         self.said: list[str] = []
-        return command(source, labels, self, self.said.append, dry_run=dry_run, picture=False, task=task)
+        return command(source, labels, self, self.said.append, dry_run=dry_run, task=task)
 
 
 def broken(folder: Path) -> Path:

@@ -53,7 +53,7 @@ def test_each_run_and_a_report_list_the_episodes_in_which_a_camera_shows_nothing
     line = f"video: black pictures, in 2 of 3 episodes (0,2): {ADVICE}"
     assert lines_of(file, output) == [line]
     assert lines_of(file, output) == [line]  # of parts that are there
-    result = invoke("label", file, "--report", "--no-picture", "--output", output)
+    result = invoke("label", file, "--report", "--output", output)
     assert (result.exit_code, f"note: {line}" in result.stderr) == (0, True)
 
 

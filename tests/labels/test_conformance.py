@@ -17,7 +17,7 @@ from PIL import Image
 
 import hdf5_writers
 from hdf5_writers import TASK, decoded, jpeg, video
-from labelling import LEROBOT, WRIST, BrightnessScorer, brightness, without_cost
+from labelling import LEROBOT, WRIST, BrightnessScorer, brightness
 from paths import ROOT
 from pictures import numbered, numbers, write_video
 from rfm_client import RewardError, UInt8Array
@@ -233,12 +233,12 @@ def test_each_frame_gets_its_label_and_a_second_run_scores_only_missing_episodes
         assert labels.frames.tolist() == list(range(len(expected[0])))
     num_scored = sum(dataset.episode(number).num_frames for number in chosen) * len(cameras)
     assert scorer.num_samples == num_scored
-    files = [without_cost(file) for file in report.files]
+    files = [file.read_bytes() for file in report.files]
     (output / ".rfm_parts" / f"{report.plan.items[0].key}.parquet").unlink()
     again = BrightnessScorer()
     report = label(dataset, again, options)
     assert again.num_samples == dataset.episode(chosen[0]).num_frames * len(cameras)
-    assert [without_cost(file) for file in report.files] == files
+    assert [file.read_bytes() for file in report.files] == files
 
 
 @every_format

@@ -42,7 +42,7 @@ class LongVideos(Dataset):
     def decoder(self, camera: str) -> None:
         return None
 
-    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+    def identity(self, episode: DatasetEpisode, camera: str) -> str:
         return str(episode.index)
 
     def check(self, episode: DatasetEpisode, camera: str) -> int:

@@ -124,6 +124,22 @@ def test_a_table_lists_episodes_of_one_kind(folders: Path) -> None:
         open_dataset(folders)
 
 
+def test_a_file_whose_name_looks_like_a_pattern_is_a_file(tmp_path: Path) -> None:
+    np.save(tmp_path / "a*b.npy", numbered(2))
+    (tmp_path / "a*b.txt").touch()
+    for task in (TASK, None):
+        dataset = open_dataset(tmp_path, task=task)
+        assert ([episode.name for episode in dataset.episodes], *dataset.notes) == (["a*b.npy"],)
+        (tmp_path / "tasks.csv").write_text(f"video,task\na*b.npy,{TASK}\n")
+
+
+def test_a_table_of_before_is_refused_also_with_a_task_for_all(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", numbered(2))
+    (tmp_path / "tasks.json").touch()
+    with pytest.raises(DatasetError, match=r"expected tasks\.csv .*, got tasks\.json: write it as tasks\.csv"):
+        open_dataset(tmp_path, task=TASK)
+
+
 def write_demos(file: Path, task: str) -> None:
     write_robomimic(file, [{"front": numbered(5)}], task)
 
@@ -131,8 +147,7 @@ def write_demos(file: Path, task: str) -> None:
 def asked(source: Path, labels: LabelOptions, *, dry_run: bool = False) -> tuple[int, list[str], set[str]]:
     """Return the exit code, the output lines, and the scored tasks."""
     scorer, said = BrightnessScorer(), list[str]()
-    picture = not source.joinpath("task_2.rfm_summary.png").exists()
-    return command(source, labels, scorer, said.append, dry_run=dry_run, picture=picture), said, scorer.tasks
+    return command(source, labels, scorer, said.append, dry_run=dry_run), said, scorer.tasks
 
 
 def test_a_folder_of_hdf5_files_is_labelled_file_by_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -144,10 +159,11 @@ def test_a_folder_of_hdf5_files_is_labelled_file_by_file(tmp_path: Path, capsys:
     files = [f"{root}/more/task_1.h5", f"{root}/task_2.hdf5", f"{root}/task_10.hdf5"]
     assert [line for line in said if line in files] == files
     for folder, stem in (("more", "task_1"), ("", "task_2"), ("", "task_10")):
-        assert (root / folder / f"{stem}.rfm_summary.png").exists()
         labels = read_episode_labels(root / folder / f"{stem}.rfm_progress.parquet", 0)
         assert labels is not None
         np.testing.assert_allclose(labels.fused.progress, brightness(numbered(5)), atol=1e-6)
+    for folder in (root, root / "more"):
+        (folder / "task_2.rfm_rewards.hdf5").write_bytes(b"labels of 0.4")
     assert asked(root, LabelOptions())[::2] == (ExitCode.OK, set())  # files of labels are no datasets
     capsys.readouterr()
 

@@ -20,7 +20,7 @@ import pytest
 from pyarrow import parquet
 
 import labelling
-from labelling import FEW, LEROBOT, BrightnessScorer, Notes, PickyScorer, without_cost
+from labelling import FEW, LEROBOT, BrightnessScorer, Notes, PickyScorer
 from rfm_client import ProgressResult, ServerUnavailableError
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 
@@ -30,7 +30,7 @@ NUM_FRAMES = 428
 
 
 def contents(output: Path) -> list[bytes]:
-    return [without_cost(output / name) for name in FILES]
+    return [(output / name).read_bytes() for name in FILES]
 
 
 def parts_of(output: Path) -> list[str]:

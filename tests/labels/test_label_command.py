@@ -56,12 +56,11 @@ def test_both_commands_write_the_same_labels_and_print_their_decisions(demo_serv
         ],
     )
     assert {"episodes": "3", "frames": "121"}.items() <= cells(served.stdout).items()
-    written = [output / name for name in ("rfm_summary.png", FILES[0], "sarm_progress.parquet", FILES[1])]
+    written = [output / name for name in (FILES[0], "sarm_progress.parquet", FILES[1])]
     assert [line for line in served.stdout.splitlines() if line.startswith(str(output))] == list(map(str, written))
-    assert written[0].read_bytes().startswith(b"\x89PNG")
 
     (output / "own").mkdir()
-    result = own(DATASET, *ENGINE, *words, "--output", output / "own", "--format", "progress", "--no-picture")
+    result = own(DATASET, *ENGINE, *words, "--output", output / "own", "--format", "progress")
     assert result.exit_code == 0, result.stderr
     assert sorted(path.name for path in (output / "own").iterdir() if path.is_file()) == [
         FILES[0],
@@ -95,7 +94,7 @@ def test_a_second_run_scores_nothing_and_a_report_needs_no_server(demo_server: E
     assert again.stdout == first.stdout
     for source in (DATASET, output / FILES[0], output / FILES[1]):
         where = ["--output", output] if source == DATASET else []
-        report = invoke("label", source, "--report", "--no-picture", *where, "--url", "grpc://localhost:1")
+        report = invoke("label", source, "--report", *where, "--url", "grpc://localhost:1")
         assert (report.exit_code, report.stderr) == (0, "")
         assert cells(report.stdout) == cells(first.stdout)
 

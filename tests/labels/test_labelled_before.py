@@ -124,16 +124,13 @@ def test_labels_of_another_dataset_or_of_lost_episodes_are_replaced_only_on_requ
     assert labelled(file, **options, overwrite=True)[0] == 0
 
 
-@pytest.mark.parametrize("verify", [False, True])
-def test_labels_of_a_video_hold_until_its_time_changes_or_where_they_are_verified_its_content(
-    tmp_path: Path, output: Path, verify: bool
-) -> None:
+def test_labels_of_a_video_hold_until_its_time_changes(tmp_path: Path, output: Path) -> None:
     root = shutil.copytree(TOY, tmp_path / TOY.name)
     video = root / "videos" / FRONT / "chunk-000" / "file-001.mp4"  # of episodes 4 to 7
-    asked: dict[str, Any] = {"verify": verify, "episodes": [3, 4], "overwrite": True}
+    asked: dict[str, Any] = {"episodes": [3, 4], "overwrite": True}
     assert labelled(root, output, **asked)[0] == sum(EPISODE_FRAMES[3:5])
     os.utime(video, (1, 1))
-    assert labelled(root, output, **asked)[0] == (0 if verify else EPISODE_FRAMES[4])
+    assert labelled(root, output, **asked)[0] == EPISODE_FRAMES[4]
     video.write_bytes(video.read_bytes() + bytes(8))
     assert labelled(root, output, **asked)[0] == EPISODE_FRAMES[4]
 

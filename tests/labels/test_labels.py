@@ -169,12 +169,10 @@ def test_the_files_have_the_documented_form(output: Path) -> None:
 
     metadata = {key.decode(): value.decode() for key, value in signals.schema.metadata.items()}
     own = {key.removeprefix("lerobot.reward_scoring."): value for key, value in metadata.items()}
-    own_names = ["descriptors", "episode_indices", "format", "provenance", "rfm.cost", "rfm.episodes", "schema_version"]
+    own_names = ["descriptors", "episode_indices", "format", "provenance", "rfm.episodes", "schema_version"]
     assert sorted(own) == own_names
     assert sorted(json.loads(own["rfm.episodes"])) == ["1", "2"]
-    assert json.loads(own["rfm.cost"])["frames"] == len(signals)
-    for key in (b"rfm.cost", b"rfm.episodes"):
-        assert progress.schema.metadata[key] == signals.schema.metadata[key]
+    assert progress.schema.metadata[b"rfm.episodes"] == signals.schema.metadata[b"rfm.episodes"]
     assert (own["format"], own["schema_version"], own["episode_indices"]) == ("lerobot.frame_signals", "1", "[1,2]")
     descriptors = json.loads(own["descriptors"])
     assert sorted(descriptors) == signal_names

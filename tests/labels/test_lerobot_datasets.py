@@ -178,7 +178,7 @@ def test_exif_data_turn_images_in_tables_and_change_the_identity_of_the_episode(
     episode = dataset.episode(0)
     np.testing.assert_array_equal(list(dataset.frames(episode, WRIST)), np.rot90(stored, -1, axes=(1, 2)))
     pictures = [save(Image.fromarray(frame)) for frame in stored]
-    assert dataset.identity(episode, WRIST, verify=False) != digest_of(pictures)
+    assert dataset.identity(episode, WRIST) != digest_of(pictures)
 
 
 def store_as_images(root: Path, camera: str, save: Callable[[Any], bytes]) -> list[np.ndarray[Any, Any]]:
@@ -410,6 +410,12 @@ def test_oddities_that_lerobot_reads_are_read_with_a_note(tmp_path: Path, change
     for number in (4, 5):
         dataset.check(dataset.episode(number), FRONT)
     assert list(dataset.notes) == notes
+
+
+@pytest.mark.parametrize("tolerance_s", [0, -1, float("nan"), float("inf"), True, "a"])
+def test_a_tolerance_is_a_number_above_0(tolerance_s: Any) -> None:
+    with pytest.raises(DatasetError, match=f"tolerance_s: expected a number above 0, got '?{tolerance_s}"):
+        open_dataset(LEROBOT / "toy_v30_many", tolerance_s=tolerance_s)
 
 
 OPENED = f"""

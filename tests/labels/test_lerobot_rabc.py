@@ -52,7 +52,7 @@ def test_topreward_s_table_is_that_of_lerobot(tmp_path: Path, run: dict[str, Any
 
 
 def check(file: Path, words: list[Any], run: dict[str, Any], atol: float) -> None:
-    done = rfm(*words, "--no-picture")
+    done = rfm(*words)
     assert done.exit_code == 0, done.output
     table = parquet.read_table(file)
     for name in ("index", "episode_index", "frame_index"):
@@ -103,10 +103,3 @@ def test_frames_that_the_model_skipped_are_filled_for_lerobot_s_weights_alone(ou
     assert (num_weighted, was_weighted) == (begin, 13)
     (told,) = [line for line in notes.lines if line.startswith("progress_sparse: filled at the ")]
     assert told.startswith(f"progress_sparse: filled at the {np.isnan(own).sum()} of {begin} frames that the model")
-
-    plain = label(
-        dataset, Comparing(max_frames=None), LabelOptions(output=output, name="plain", fill="none", **options)
-    )
-    unfilled = parquet.read_table(plain.files[0])
-    np.testing.assert_array_equal(unfilled["progress_sparse"].to_numpy(), own)
-    assert b"rfm.progress_sparse_fill" not in unfilled.schema.metadata

@@ -86,7 +86,7 @@ REFUSED = {
     "no table": (None, "expected tasks.csv with the task of each video, got none"),
     "no column of tasks": ("video\nb.mp4\n", "expected the columns video and task, got video"),
     "no task": ("video,task\nb.mp4,\n", "b.mp4: expected a task as a sentence, got none"),
-    "a task of blanks": ("video,task\nb.mp4,  \n", "b.mp4: expected a task as a sentence, got '  '"),
+    "a task of blanks": ("video,task\nb.mp4,  \n", "b.mp4: expected a task as a sentence, got none"),
     "a video that is missing": ("video,task\nc.mp4,a\n", "c.mp4: expected a video file, got none"),
 }
 

@@ -22,6 +22,7 @@ import pytest
 from PIL import Image
 from pyarrow import parquet
 
+import hdf5_writers as writers
 from gateway_requests import failure
 from gateways import inside
 from labelling import LEROBOT, BrightnessScorer
@@ -285,7 +286,12 @@ def test_a_dataset_that_changes_to_show_another_file_is_not_read(
 
 BROKEN: dict[str, tuple[str, bytes | None, str, str]] = {  # a file, the content, the requested path, the message
     "no video": (VIDEO, None, OF_VIDEO_0, "file-000.mp4: expected a video file, got none"),
-    "a play list": (VIDEO, b"#EXTM3U\n/etc/passwd\n", OF_VIDEO_0, "expected a whole video file, got Invalid data"),
+    "a play list": (
+        VIDEO,
+        b"#EXTM3U\n/etc/passwd\n",
+        OF_VIDEO_0,
+        "expected a file with a video stream, got a file of another kind",
+    ),
     "another video": (
         VIDEO,
         (LEROBOT / "toy_v30_many" / VIDEO.replace("000.mp4", "002.mp4")).read_bytes(),
@@ -309,6 +315,13 @@ def test_a_dataset_that_breaks_says_why(
         told = failure(get(path), 500)
         assert re.search(message, told), told
         assert str(tmp_path) not in told
+
+
+def test_a_frame_of_another_size_is_refused_not_stretched(tmp_path: Path) -> None:
+    frames = [writers.jpeg(frame) for frame in (*writers.video(3), writers.video(1)[0, :40])]
+    with serving(writers.write_aloha(tmp_path / "demos.hdf5", {"high": frames})) as get:
+        told = failure(get("/0/episodes/0/videos/0"), 500)
+    assert "high: frame 3: expected a frame of 48 x 64 pixels, as the first, got 40 x 64 pixels" in told
 
 
 def test_labels_that_come_or_change_are_shown_at_once(tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ def test_a_command_of_the_other_program_is_refused_with_that_program_s_name() ->
 
 DEFAULTS = {
     "rfm-client score": ["default: grpc://localhost:8001; variable: RFM_URL", "default: 60", "default: --subsample"],
-    "rfm-client label": ["default: --picture", "default: 4", "variable: RFM_API_KEY_FILE"],
+    "rfm-client label": ["default: threads", "default: 4", "variable: RFM_API_KEY_FILE"],
     "rfm-client wait": ["Time limit, in seconds. [0.001 to 86400; default: 120]"],
     "rfm gateway": ["Port to listen on. [1 to 65535; default: 8000]", "default: --viewer"],
     "rfm serve": ["--gateway-viewer / --gateway-no-viewer", "default: --gateway-viewer", "default: 127.0.0.1"],

@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 
 import stand_in_triton
-from commands import REPOSITORY, nothing_left_behind
+from commands import REPOSITORY, is_alive, nothing_left_behind
 from in_process import rfm
 from rfm.config import ServeConfig
 from rfm.serve import access
 from rfm.serve.access import PORTS, Endpoints, GrpcTls, check_version, free_ports
 from rfm.serve.installation import ServerStartError
-from rfm.serve.processes import children_of, has_ended
+from rfm.serve.processes import children_of
 from rfm.serve.triton_server import TritonServer
 from rfm_client.options import ConfigError
 from secured import Papers
@@ -107,7 +107,7 @@ def test_children_are_found_dead_or_alive(monkeypatch: pytest.MonkeyPatch, has_l
     children = [subprocess.Popen(["sleep", "3600"]) for _ in range(2)]
     try:
         children[0].kill()
-        wait_for(lambda: has_ended(children[0].pid))
+        wait_for(lambda: not is_alive(children[0].pid))
         assert {child.pid for child in children} <= set(children_of(os.getpid()))
         assert os.getppid() not in children_of(os.getpid())
     finally:

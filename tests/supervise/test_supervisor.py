@@ -68,8 +68,9 @@ class Supervised:
 @contextmanager
 def supervised(folder: Path, *models: str) -> Iterator[Supervised]:
     repository, program = stand_in_triton.repository(folder, *models), stand_in_triton.installation(folder)
-    server, status_port = TritonServer(repository, Endpoints.free(), program), Endpoints.free().http_port
-    watched = Supervisor(server, status_port=status_port, probe_s=0.05, hang_s=HANG_S, triton_silent_s=SILENT_S)  # type: ignore[arg-type]
+    server = TritonServer(repository, Endpoints.free(), program, hang_s=HANG_S)  # type: ignore[arg-type]
+    status_port = Endpoints.free().http_port
+    watched = Supervisor(server, status_port=status_port, probe_s=0.05, triton_silent_s=SILENT_S)
     handlers: list[Callable[..., None]] = []
 
     def take(handler: Callable[..., None]) -> Any:

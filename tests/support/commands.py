@@ -15,7 +15,7 @@ import psutil
 
 from paths import ROOT
 from rfm.serve.access import Endpoints
-from rfm.serve.processes import REGION_PREFIX, SHARED_MEMORY, has_ended
+from rfm.serve.processes import REGION_PREFIX, SHARED_MEMORY
 
 REPOSITORY = ROOT / "model_repository"
 RFM = Path(sys.executable).parent / "rfm"
@@ -25,8 +25,11 @@ OWNER = re.compile(rf"{REGION_PREFIX}_(\d+)_")
 
 
 def is_alive(pid: int) -> bool:
-    """Return True if the process has not ended."""
-    return not has_ended(pid)
+    """Return False for a zombie or an unknown id."""
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
 
 
 def command(repository: Path, endpoints: Endpoints) -> list[str]:

@@ -6,7 +6,6 @@ python tests/support/labelling.py DATASET OUTPUT SECONDS_A_REQUEST
 
 from __future__ import annotations
 
-import io
 import json
 import sys
 import threading
@@ -110,7 +109,7 @@ def command(
 ) -> int:
     """Run ``rfm-client label`` with a scorer instead of a server. Return the exit code.
 
-    say: gets each line of its output; run: ``dry_run``, ``picture``
+    say: gets each line of its output; run: ``dry_run``
     """
     from rfm_labels.commands.label import EpisodeTexts, LabelCommand, RunOptions
 
@@ -140,14 +139,6 @@ def tasks_of(root: Path) -> dict[int, str]:
     numbers = columns.pop("task_index")
     (sentences,) = columns.values()
     return dict(zip(numbers, sentences, strict=True))
-
-
-def without_cost(file: Path) -> bytes:
-    """A label file without the time that the run took: equal for equal runs."""
-    table, content = parquet.read_table(file), io.BytesIO()
-    metadata = {key: value for key, value in table.schema.metadata.items() if key != b"rfm.cost"}
-    parquet.write_table(table.replace_schema_metadata(metadata), content)
-    return content.getvalue()
 
 
 @contextmanager

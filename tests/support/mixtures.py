@@ -20,7 +20,7 @@ from rfm_client import (
     SimilaritySample,
 )
 from rfm_client.contract.wire import Tensors
-from rfm_client.transport.calls import connect
+from rfm_client.transport.calls import TritonTransport
 from servers import Served, wait_for
 from tolerances import TOLERANCE
 from trajectories import random_trajectory
@@ -75,7 +75,7 @@ def infer(url: str, model: str, tensors: Tensors, outputs: list[str]) -> Tensors
     """The tensors as they stand, right or wrong, in one request."""
 
     async def ask() -> Tensors:
-        transport = connect(url)
+        transport = TritonTransport(url)
         try:
             return (await transport.infer(model, tensors, outputs, timeout_s=30)).tensors
         finally:

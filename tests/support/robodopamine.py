@@ -13,7 +13,7 @@ import torch
 from engines import asked_engine
 from reward_models import ROOT, Reference
 from rfm.engine import Engine
-from rfm.families.robodopamine.answers import parsed
+from rfm.families.robodopamine.prompts import parsed
 from rfm_client import ProgressSample, Trajectory
 
 FOLDER = ROOT / "robodopamine"

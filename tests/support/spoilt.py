@@ -5,22 +5,17 @@ from __future__ import annotations
 
 import json
 import re
-import shlex
 import shutil
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
-import pytest
 import torch
 import yaml
 from safetensors.torch import load_file, save_file
 
 import goldens
 import reward_models
-from rfm.files import CheckpointError
 
 WEIGHTS = "model.safetensors"
 
@@ -167,16 +162,6 @@ def text(name: str, content: str) -> Spoil:
 def text_settings(**changes: Any) -> Spoil:
     """Changes settings of a vision-language model's language model."""
     return in_json("config.json", lambda content: content["text_config"].update(changes))
-
-
-def convert(load: Callable[[Path], object], folder: Path) -> None:
-    """Run the shell command from the refusal of ``load`` in this process."""
-    with pytest.raises(CheckpointError) as refusal:
-        load(folder)
-    (command,) = re.findall(r"python -c .*", str(refusal.value))
-    _, _, code, *arguments = shlex.split(command)
-    with mock.patch.object(sys, "argv", ["-c", *arguments]):
-        exec(code, {})
 
 
 def without(name: str, heads: Sequence[str], target: Path) -> Path:

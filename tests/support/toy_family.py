@@ -21,11 +21,10 @@ from rfm.config import CheckpointConfig
 from rfm.engine import Execution
 from rfm.engine.family import NETWORK, Family
 from rfm.engine.feature_cache import FeatureCache
-from rfm.engine.predictor import RowScores, frame_scores, of_rows, prefix_indices
+from rfm.engine.predictor import Predictor, RowScores, frame_scores, prefix_indices
 from rfm.files import NETWORK_CONFIG, WEIGHTS
 from rfm.published.reader import Loaded, Reader
 from rfm_client import (
-    FrameScores,
     InvalidSampleError,
     ProgressSample,
     RewardError,
@@ -99,13 +98,10 @@ class Palette:
 
 
 @dataclass(frozen=True)
-class ToyPredictor:
+class ToyPredictor(Predictor[Any, Any]):
     """A row is the embeddings of a sample's trajectories."""
 
     network: Redness
-    works_ahead: bool = False
-    has_progress: bool = True
-    reads_views: bool = False
     has_success: bool = True
 
     def rows(self, sample: Sample) -> list[list[np.ndarray]]:
@@ -118,12 +114,6 @@ class ToyPredictor:
 
     def num_tokens(self, row: list[np.ndarray]) -> int:
         return sum(map(len, row))
-
-    def sequences(self, row: Any) -> Sequence[Any]:
-        return (row,)
-
-    def work_ahead(self, rows: Sequence[list[np.ndarray]]) -> None:
-        pass
 
     def collate(self, rows: Sequence[list[np.ndarray]]) -> Tensor:
         return torch.from_numpy(np.concatenate([video for row in rows for video in row]))
@@ -142,9 +132,6 @@ class ToyPredictor:
             query = (of_row[0][-1] - of_row[1][-1]).sigmoid().item() if len(row) == 2 else None
             scored.append(RowScores([frame_scores(each, each[:, 0]) for each in of_row], query))
         return scored
-
-    def joined(self, sample: Sample, rows: Sequence[RowScores]) -> FrameScores:
-        return of_rows(sample, rows)
 
 
 @dataclass(frozen=True)

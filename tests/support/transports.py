@@ -6,17 +6,13 @@ from __future__ import annotations
 from typing import Any
 
 from rfm_client.contract.wire import Tensors
-from rfm_client.serving import Credentials
-from rfm_client.transport.calls import Answer, GrpcTransport
+from rfm_client.transport.calls import Answer, TritonTransport
 
 __all__ = ["Answer", "Connection", "Recording", "Tensors"]
 
 
-class Connection(GrpcTransport):
-    """A gRPC connection to a real server, for tests to extend."""
-
-    def __init__(self, url: str) -> None:
-        super().__init__(url, Credentials(), shared_memory=False)
+class Connection(TritonTransport):
+    """A connection to a real server, for tests to extend."""
 
 
 class Recording(Connection):

@@ -14,8 +14,7 @@ import goldens
 from engines import load_engine
 from goldens import assert_close as assert_close
 from rfm import published
-from rfm.families.robometer.checkpoint import VlmCheckpoint
-from rfm.families.robometer.predictor import VlmPredictor
+from rfm.families.robometer.checkpoint import VlmCheckpoint, VlmPredictor
 from rfm.qwen.backbone import UNIT
 from rfm.qwen.batch import VlmRow
 from rfm_client import Trajectory

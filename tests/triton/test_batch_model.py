@@ -17,7 +17,7 @@ import torch
 
 from batch_models import BREAKS, CONFIG, FAILS, LOGGED, METRICS, REFUSED, WIDTHS, Model, Request, backend, request  # noqa: F401  a fixture
 from rfm.engine import Execution
-from rfm.engine.threads import use_threads
+from rfm.engine.threads import num_preparing, use_threads
 from rfm.probe_request import probe_request
 from rfm.triton_model import batch_model
 from rfm.triton_model.batch_model import ASKING_S
@@ -328,7 +328,7 @@ def test_the_cores_of_a_machine_are_shared_among_the_instances(
     placement = Placement.of(args, config, {"torch_threads": "0"})
     assert placement.device == (torch.device("cuda", 3) if gpus else torch.device("cpu"))
     assert placement.num_threads == (2 if gpus else 8)
-    assert placement.num_preparing == (2 if gpus else 1)
+    assert num_preparing(placement.device, placement.num_threads) == (2 if gpus else 1)
     assert Placement.of(args, config, {"torch_threads": "5"}).num_threads == 5
 
 

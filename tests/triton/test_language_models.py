@@ -384,7 +384,7 @@ def test_the_command_line_sends_views_and_a_goal_and_only_where_they_are_read(as
 def labelled(asked: Served, folder: Path, sample: ProgressSample, model: str, *words: object) -> Any:
     """Label a folder of two equal videos, the second after the first. Return the columns of the signals."""
     folder.mkdir()
-    command = ["label", folder, "--task", sample.trajectory.task, "--no-picture", "--name", "own", *words]
+    command = ["label", folder, "--task", sample.trajectory.task, "--name", "own", *words]
     np.save(folder / "a.npy", sample.trajectory.positions)
     asked.command(*command, model=model)
     shutil.rmtree(folder / ".own_parts")  # restored from the file, with all columns
@@ -424,7 +424,7 @@ def test_labels_of_seconds_name_the_rule_that_makes_progress(asked: Served, tmp_
 
 
 def test_a_dataset_is_labelled_through_the_server(asked: Served, tmp_path: Path) -> None:
-    words = ["label", DATASET, "--output", tmp_path, "--no-picture"]
+    words = ["label", DATASET, "--output", tmp_path]
     expected = "whole of this model, whose scores are relative to the whole episode, got prefix; give --mode whole"
     assert f"mode: expected {expected}" in asked.command(*words, model="top", fails=True)
     unknown = asked.command(*words, model="robo", fails=True)

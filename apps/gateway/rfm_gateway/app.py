@@ -72,9 +72,8 @@ def create_app(
     started_by: the command that a person repeats to restart this gateway
     client: for Triton; None: as ``config`` says
 
-    Raises OSError for a missing folder, ValueError for a malformed URL or an unusable file.
+    Raises ValueError for a malformed URL or an unusable file.
     """
-    folder = config.resolved_folder
     client, metrics = client or config.client(), GatewayMetrics()
     limits = BodyLimits(config.max_body_mib * MIB, config.timeout_s)
     parts = ServedParts()
@@ -108,7 +107,7 @@ def create_app(
     guards = [] if api_key is None else [Depends(key_check(api_key))]
     guarded = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
     evaluator = Evaluator(
-        client, limits, parts, folder, use_frame_steps=config.use_frame_steps, refuse_blank=config.refuse_blank
+        client, limits.timeout_s, parts, use_frame_steps=config.use_frame_steps, refuse_blank=config.refuse_blank
     )
     place = Depends(Places(config, metrics).taken)
     _add_evaluations(guarded, limits, evaluator, metrics, place)

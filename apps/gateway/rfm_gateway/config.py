@@ -49,7 +49,6 @@ class GatewayConfig(Settings):
     api_key_file: Path | None = setting(None, f"File with the API key that requests need. Default: {KEY_VARIABLE}.")
     cors_origin: tuple[str, ...] = setting((), "Web origin that may send requests. Repeat for more.")
     allow_host: tuple[str, ...] = setting((), "Host name that callers without a key may use. Repeat for more.")
-    allow_folder: Path | None = setting(None, "Folder whose files requests may name.")
     timeout_s: float = setting(
         120.0,
         "Seconds for each stage of a request: arrival, wait, scoring.",
@@ -87,14 +86,6 @@ class GatewayConfig(Settings):
         if self.triton is None:
             raise ConfigError.at("triton", "the URL of a Triton", "none")
         return self.triton
-
-    @property
-    def resolved_folder(self) -> Path | None:
-        """The allowed folder, with links resolved. Raises ConfigError if it is missing."""
-        try:
-            return None if self.allow_folder is None else self.allow_folder.resolve(strict=True)
-        except OSError as error:
-            raise ConfigError.at("allow_folder", "a folder", error) from None
 
     @property
     def credentials(self) -> Credentials:

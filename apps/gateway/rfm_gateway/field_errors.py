@@ -102,8 +102,6 @@ def _of_trajectory(field: str, sample: schema.Sample) -> Path:
     given = sample.named_trajectories[names[0]]
     if field == "num_frames":
         field = "video_embeddings" if given.frames is None else "frames"
-    if field == "video_embeddings" and given.video_embeddings is None and given.embeddings_path is not None:
-        field = "embeddings_path"
     return (names[0], field)
 
 

@@ -20,21 +20,11 @@ from rfm_gateway.config import GatewayConfig
 
 Returned = TypeVar("Returned")
 
-EVALUATIONS = ("/evaluate_batch", "/evaluate_batch_npy", "/viewer/score", "/viewer/compare")
-ENDPOINTS = (*EVALUATIONS, "/gpu_status", "/health", "/model_info", "/metrics")
+ENDPOINTS = (
+    *("/evaluate_batch", "/evaluate_batch_npy", "/viewer/score", "/viewer/compare"),
+    *("/gpu_status", "/health", "/model_info", "/metrics"),
+)
 CALLER_LEFT = 499  # as nginx logs it
-REJECTIONS = {
-    401: "key",
-    403: "origin",
-    408: "slow",
-    413: "size",
-    415: "format",
-    421: "host",
-    422: "invalid",
-    CALLER_LEFT: "hung_up",
-    503: "unavailable",
-    504: "deadline",
-}
 
 REQUEST_ID_HEADER = "X-Request-ID"
 RETRY_AFTER = {"Retry-After": "1"}
@@ -56,12 +46,6 @@ class GatewayMetrics:
             buckets=_BUCKETS_S,
             registry=self._registry,
         )
-        self.rejections = Counter(
-            "rfm_gateway_rejections",
-            "Evaluations that were not scored, by reason.",
-            ("reason",),
-            registry=self._registry,
-        )
         self.samples = Counter("rfm_gateway_samples", "Samples scored.", ("sample_type",), registry=self._registry)
         self.in_flight = Gauge("rfm_gateway_requests_in_flight", "Evaluations under way.", registry=self._registry)
         self.waiting = Gauge("rfm_gateway_requests_waiting", "Evaluations not begun.", registry=self._registry)
@@ -71,8 +55,6 @@ class GatewayMetrics:
         endpoint = path if path in ENDPOINTS else "other"  # callers choose the path, and each label value takes memory
         self.requests.labels(endpoint, str(code)).inc()
         self.durations.labels(endpoint).observe(duration_s)
-        if path in EVALUATIONS and code >= 400:
-            self.rejections.labels(REJECTIONS.get(code, "other")).inc()
 
     def text(self) -> bytes:
         """Return the metrics in Prometheus text format."""

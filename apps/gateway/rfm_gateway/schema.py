@@ -43,8 +43,8 @@ def _nested(depth: int) -> dict[str, Any]:
     return _NUMBERS if depth == 1 else {"type": "array", "items": _nested(depth - 1), "minItems": 1}
 
 
-def _array_schema(description: str, depth: int, *others: dict[str, Any]) -> WithJsonSchema:
-    return WithJsonSchema({"description": description, "anyOf": [_nested(depth), _UPLOADED, *others, {"type": "null"}]})
+def _array_schema(description: str, depth: int) -> WithJsonSchema:
+    return WithJsonSchema({"description": description, "anyOf": [_nested(depth), _UPLOADED, {"type": "null"}]})
 
 
 def _array(value: Any, info: ValidationInfo) -> Any:
@@ -82,7 +82,7 @@ def _check_leaves(array: list[Any]) -> None:
 
 
 def _frames(value: Any, info: ValidationInfo) -> Any:
-    """Return an array of frames, or a list of image file names."""
+    """Return an array of frames, or a list of file names, which beside embeddings is ignored."""
     if isinstance(value, list) and value and all(isinstance(name, str) for name in value):
         return value
     return _array(value, info)
@@ -106,11 +106,7 @@ class TrajectoryInput(BaseModel):
     frames: Annotated[
         Any,
         BeforeValidator(_frames),
-        _array_schema(
-            "[T, H, W, 3], RGB, 0..255; or names of image files in the folder that the gateway may read, if it has one",
-            4,
-            {"type": "array", "items": {"type": "string"}},
-        ),
+        _array_schema("[T, H, W, 3], RGB, 0..255", 4),
     ] = None
     video_embeddings: Annotated[Any, BeforeValidator(_array), _array_schema("[T, D]", 2)] = None
     text_embedding: Annotated[
@@ -118,24 +114,19 @@ class TrajectoryInput(BaseModel):
         BeforeValidator(_array),
         _array_schema("[Dt], the embedding of the task; if it is missing, a served encoder encodes the task", 1),
     ] = None
-    embeddings_path: str | None = Field(
-        None, description="Name of a .npy or .npz file of embeddings in the folder that the gateway may read."
-    )
+    embeddings_path: Any = None  # alone it is refused, since the gateway reads no files
     data_source: Any = None
     metadata: Any = None
-
-    @property
-    def has_embeddings(self) -> bool:
-        """True with embeddings, or with an embeddings file and no frames."""
-        return self.video_embeddings is not None or (self.embeddings_path is not None and self.frames is None)
 
     @property
     def uint8_frames(self) -> UInt8Array:
         """The frames as an uint8 array [T, H, W, C], converted as the evaluation server does.
 
         Floats are clipped and truncated. A single frame becomes a one-frame video. RGBA loses its alpha channel.
-        Raises InvalidSampleError for integers outside 0..255, and for other types and shapes.
+        Raises InvalidSampleError for integers outside 0..255, for other types and shapes, and for file names.
         """
+        if isinstance(self.frames, list):
+            raise InvalidSampleError.at("frames", "an array, since the gateway reads no files", "names of files")
         _check_axes(self.frames)
         array: np.ndarray[Any, Any] = self.frames if self.frames.ndim != 3 else self.frames[np.newaxis]
         if array.ndim == 4 and array.shape[-1] == RGBA_CHANNELS:

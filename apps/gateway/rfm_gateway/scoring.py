@@ -7,7 +7,6 @@ import asyncio
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from itertools import chain, islice
-from pathlib import Path
 from traceback import clear_frames
 from typing import TypeAlias, cast
 
@@ -35,9 +34,8 @@ from rfm_client.frames import BlankFrames
 from rfm_client.options import first_names
 from rfm_client.serving import off_loop
 from rfm_gateway import schema
-from rfm_gateway.body import Batch, BodyLimits
+from rfm_gateway.body import Batch
 from rfm_gateway.field_errors import refused
-from rfm_gateway.folder import RequestFiles
 from rfm_gateway.observe import within
 from rfm_gateway.state import ServedParts
 
@@ -58,15 +56,13 @@ class Evaluator:
     """Scores batches with the server behind ``client``.
 
     parts: parts that were served: if one is missing now, that is a server error
-    folder: folder with files that samples may name, with links resolved; None: no files
     use_frame_steps: for requests that do not say
     refuse_blank: True: black and single-colour frames are invalid
     """
 
     client: AsyncRewardClient
-    limits: BodyLimits
+    timeout_s: float
     parts: ServedParts
-    folder: Path | None
     _: KW_ONLY
     use_frame_steps: bool
     refuse_blank: bool
@@ -76,28 +72,22 @@ class Evaluator:
 
         No sample may be left out: that would shift later scores, or be read as a reward of 0.
 
-        Raises RequestValidationError that lists all invalid samples, HTTPException for files that are too large, and
-        ServerError.
+        Raises RequestValidationError that lists all invalid samples, and ServerError.
         """
-        with self.limits.decoding() as take:
-            scoring = self._evaluate(batch, RequestFiles(self.folder, take), request_id)
-            try:
-                return await within(self.limits.timeout_s, scoring)
-            except Exception as error:
-                clear_frames(error.__traceback__)  # otherwise the traceback's variables keep the arrays in memory
-                raise
+        try:
+            return await within(self.timeout_s, self._evaluate(batch, request_id))
+        except Exception as error:
+            clear_frames(error.__traceback__)  # otherwise the traceback's variables keep the arrays in memory
+            raise
 
-    async def _evaluate(
-        self, batch: Batch, files: RequestFiles, request_id: str
-    ) -> tuple[schema.EvaluateBatchAnswer, str]:
+    async def _evaluate(self, batch: Batch, request_id: str) -> tuple[schema.EvaluateBatchAnswer, str]:
         embeddings, frames = await self._served(batch.samples)
         texts = await self._texts(batch.samples, request_id) if embeddings is not None else {}
         use_frame_steps = self.use_frame_steps if batch.use_frame_steps is None else batch.use_frame_steps
         by_prefix = use_frame_steps and frames is not None and frames.scores_whole_prefixes
         frame_steps = _frame_steps(frames) if use_frame_steps and not by_prefix else 0
-        conversion = _Conversion(embeddings, frames, texts, files, frame_steps, self.refuse_blank)
-        num_bytes = batch.num_bytes if self.folder is None else None  # files may be large
-        samples, warning = await off_loop(num_bytes, conversion.samples, batch)
+        conversion = _Conversion(embeddings, frames, texts, frame_steps, self.refuse_blank)
+        samples, warning = await off_loop(batch.num_bytes, conversion.samples, batch)
         asked = [_prefixes(sample) if by_prefix else [sample] for sample in samples]
         flat = chain.from_iterable(asked)
         outcomes = iter(await self.client.evaluate(flat, return_errors=True, request_id=request_id))
@@ -121,7 +111,7 @@ class Evaluator:
         would send a request each time.
         """
         given = [trajectory for sample in samples for trajectory in sample.named_trajectories.values()]
-        embedded = [trajectory.has_embeddings for trajectory in given]
+        embedded = [trajectory.video_embeddings is not None for trajectory in given]
         embeddings = await self._model_info(frames=False) if any(embedded) else None
         has_frames = any(trajectory.frames is not None for trajectory in given)
         needs_frames = has_frames and not (embeddings is not None and all(embedded))
@@ -138,7 +128,7 @@ class Evaluator:
     async def _texts(self, samples: Sequence[schema.Sample], request_id: str) -> Mapping[str, Text]:
         """Return embeddings by task, for tasks without an embedding; empty without an encoder."""
         firsts = [next(iter(sample.named_trajectories.values())) for sample in samples]
-        unread = [first.task for first in firsts if first.has_embeddings and first.text_embedding is None]
+        unread = [each.task for each in firsts if each.video_embeddings is not None and each.text_embedding is None]
         tasks = {task for task in unread if task and task.strip()}
         texts: dict[str, Text] = {}
         if tasks:
@@ -169,14 +159,13 @@ class _Conversion:
     embedding_model: ModelInfo | None
     frame_model: ModelInfo | None
     texts: Mapping[str, Text]
-    files: RequestFiles
     frame_steps: int
     refuse_blank: bool
 
     def samples(self, batch: Batch) -> tuple[list[Sample], str]:
         """Return the client's samples, and a warning about those that show nothing.
 
-        Raises RequestValidationError that lists all invalid samples, and HTTPException as ``RequestFiles`` does.
+        Raises RequestValidationError that lists all invalid samples.
         """
         converted: list[Sample] = []
         errors: dict[int, InvalidSampleError] = {}
@@ -191,7 +180,8 @@ class _Conversion:
 
     def _sample(self, sample: schema.Sample) -> Sample:
         given = sample.named_trajectories
-        by_embeddings = self.embedding_model is not None and all(each.has_embeddings for each in given.values())
+        are_embedded = all(each.video_embeddings is not None for each in given.values())
+        by_embeddings = self.embedding_model is not None and are_embedded
         trajectories: list[Trajectory] = []
         for name, each in given.items():
             try:
@@ -205,15 +195,12 @@ class _Conversion:
         return kind(*trajectories)
 
     def _of_embeddings(self, given: schema.TrajectoryInput, needs_text: bool) -> Trajectory:
-        video, text = given.video_embeddings, given.text_embedding
-        if video is None:
-            in_file = self.files.embeddings(given.embeddings_path or "")
-            video, text = in_file.video_embeddings, in_file.text_embedding if text is None else text
+        text = given.text_embedding
         if text is None and given.task is not None:
             text = self.texts.get(given.task)
             if isinstance(text, InvalidSampleError):
                 raise text
-        trajectory = Trajectory(video_embeddings=video, text_embedding=text, task=given.task or "")
+        trajectory = Trajectory(video_embeddings=given.video_embeddings, text_embedding=text, task=given.task or "")
         assert self.embedding_model is not None
         widths = {"video_embeddings": self.embedding_model.video_dim, "text_embedding": self.embedding_model.text_dim}
         for where, width in widths.items():
@@ -226,18 +213,20 @@ class _Conversion:
         return trajectory
 
     def _of_frames(self, given: schema.TrajectoryInput) -> Trajectory:
-        if given.frames is None and given.has_embeddings and self.embedding_model is not None:
+        if given.frames is None and given.video_embeddings is None:
+            if given.embeddings_path is not None:
+                expected = "video_embeddings as an array, since the gateway reads no files"
+                raise InvalidSampleError.at("embeddings_path", expected, "the name of a file")
+            raise InvalidSampleError.at("frames", "frames", "neither frames nor video_embeddings")
+        if given.frames is None and self.embedding_model is not None:
             raise InvalidSampleError.at("video_embeddings", "them in both trajectories or neither", "one of two")
         if given.frames is None:
-            if given.has_embeddings:
-                expected = "frames, since no model for embeddings is served"
-                raise InvalidSampleError.at("video_embeddings", expected, "embeddings")
-            raise InvalidSampleError.at("frames", "frames", "neither frames nor video_embeddings")
+            expected = "frames, since no model for embeddings is served"
+            raise InvalidSampleError.at("video_embeddings", expected, "embeddings")
         if self.frame_model is None:
             expected = "embeddings, since no model for raw frames is served"
             raise InvalidSampleError.at("frames", expected, "frames")
-        frames = self.files.frames(given.frames) if isinstance(given.frames, list) else given.uint8_frames
-        trajectory = Trajectory(frames=frames, task=given.task or "")
+        trajectory = Trajectory(frames=given.uint8_frames, task=given.task or "")
         if self.refuse_blank:
             refuse_blank_frames(trajectory)
         return trajectory

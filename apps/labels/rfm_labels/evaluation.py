@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.datasets.lerobot_meta import EPISODES_FILE, column_types, json_lines, read_table
-from rfm_labels.label_files import read_cost, read_label_table, reward_name
+from rfm_labels.label_files import read_label_table, reward_name
 from rfm_labels.metadata import PROGRESS, SUCCESS
 from rfm_labels.summary import BACKWARDS_BY, voted_success
 
@@ -58,7 +58,6 @@ class Evaluation:
     final_of_successes, final_of_failures: mean progress at the last frame; None: no such episode
     final: mean progress at the last frame, over all episodes
     backwards: mean share of steps on which progress falls by more than 0.01
-    frames_per_s: labelling speed; None: not in the file
     final_progress: float64 [E], progress at the last frame
     """
 
@@ -74,22 +73,7 @@ class Evaluation:
     final_of_failures: float | None
     final: float
     backwards: float
-    frames_per_s: float | None
     final_progress: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class Agreement:
-    """How closely two label files agree on progress. Means are over episodes.
-
-    spearman: mean rank correlation between the two progress curves; None: one is constant in every episode
-    distance: mean absolute difference
-    """
-
-    first: str
-    second: str
-    spearman: float | None
-    distance: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +87,6 @@ class LabelComparison:
     """
 
     evaluations: Sequence[Evaluation]
-    agreements: Sequence[Agreement]
     episodes: Sequence[int]
     is_success: npt.NDArray[np.bool_] | None
     num_left_out: int
@@ -114,7 +97,6 @@ class LabelComparison:
 class _Scores:
     """An episode's labelled frames. success: None: not predicted."""
 
-    frames: npt.NDArray[np.int64]
     progress: Floats
     success: Floats | None
 
@@ -139,13 +121,8 @@ def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool | None] |
         common = [episode for episode in common if outcomes[episode] is not None]
         require("outcome", len(common) > 0, "one that is known", f"none for {in_all} episodes")
     is_success = None if outcomes is None else np.array([outcomes[episode] for episode in common])
-    evaluations = [
-        _evaluation(name, file, [read[name][each] for each in common], is_success)
-        for name, file in zip(names, files, strict=True)
-    ]
-    pairs = [(first, second) for index, first in enumerate(names) for second in names[index + 1 :]]
-    agreements = [_agreement(first, second, read[first], read[second], common) for first, second in pairs]
-    return LabelComparison(evaluations, agreements, common, is_success, len(everywhere) - in_all, in_all - len(common))
+    evaluations = [_evaluation(name, [read[name][each] for each in common], is_success) for name in names]
+    return LabelComparison(evaluations, common, is_success, len(everywhere) - in_all, in_all - len(common))
 
 
 def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool | None]:
@@ -217,8 +194,6 @@ def _episodes(file: Path) -> dict[int, _Scores]:
     table = read_label_table(file)
     require(file, len(table) > 0, "labels", "none")
     episodes = table["episode_index"].to_numpy()
-    has_frames = "frame_index" in table.column_names
-    require(file, has_frames, "the column frame_index", ", ".join(table.column_names))
     frames, progress = table["frame_index"].to_numpy(), table[PROGRESS].to_numpy()
     success = table[SUCCESS].to_numpy() if SUCCESS in table.column_names else None
     scores = {}
@@ -228,14 +203,11 @@ def _episodes(file: Path) -> dict[int, _Scores]:
         rows = own[np.isfinite(progress[own])]  # NaN: unlabelled frame
         require(f"{file}: episode {episode}", len(rows) > 0, "progress", "none")
         predicted = None if success is None or np.isnan(success[rows]).any() else success[rows]
-        scores[episode] = _Scores(frames[rows], progress[rows], predicted)
+        scores[episode] = _Scores(progress[rows], predicted)
     return scores
 
 
-def _evaluation(
-    name: str, file: Path, scores: Sequence[_Scores], is_success: npt.NDArray[np.bool_] | None
-) -> Evaluation:
-    cost = read_cost(file)
+def _evaluation(name: str, scores: Sequence[_Scores], is_success: npt.NDArray[np.bool_] | None) -> Evaluation:
     final = np.array([each.progress[-1] for each in scores], np.float64)
     orders = [_order(each.progress) for index, each in enumerate(scores) if is_success is None or is_success[index]]
     known = [order for order in orders if order is not None]
@@ -244,7 +216,7 @@ def _evaluation(
     return Evaluation(
         name=name,
         num_episodes=len(scores),
-        num_frames=sum(len(each.frames) for each in scores),
+        num_frames=sum(len(each.progress) for each in scores),
         spearman=_mean([rho for rho, _ in known]),
         kendall=_mean([tau for _, tau in known]),
         num_constant=len(orders) - len(known),
@@ -254,40 +226,18 @@ def _evaluation(
         final_of_failures=None if is_success is None else _mean(final[~is_success]),
         final=float(final.mean()),
         backwards=float(np.mean(falls)),
-        frames_per_s=None if cost is None else cost.frames_per_s,
         final_progress=final,
     )
 
 
-def _agreement(
-    first: str, second: str, of_first: Mapping[int, _Scores], of_second: Mapping[int, _Scores], episodes: Sequence[int]
-) -> Agreement:
-    orders, distances = [], []
-    for episode in episodes:
-        one, other = of_first[episode], of_second[episode]
-        frames, mine, theirs = np.intersect1d(one.frames, other.frames, assume_unique=True, return_indices=True)
-        require(f"labels: episode {episode}", len(frames) > 0, f"a frame that {first} and {second} have", "none")
-        orders.append(_spearman(one.progress[mine], other.progress[theirs]))
-        distances.append(np.abs(one.progress[mine].astype(np.float64) - other.progress[theirs]).mean())
-    mean = float(np.mean(distances))
-    return Agreement(first, second, _mean([order for order in orders if order is not None]), mean)
-
-
 def _order(progress: Floats) -> tuple[float, float] | None:
     """Return Spearman's rho and Kendall's tau-b between progress and time; None: progress is constant."""
-    from scipy.stats import kendalltau
+    from scipy.stats import kendalltau, spearmanr
 
     time = np.arange(len(progress))
-    rho = _spearman(progress, time)
-    return None if rho is None else (rho, float(kendalltau(progress, time).statistic))
-
-
-def _spearman(first: npt.NDArray[Any], second: npt.NDArray[Any]) -> float | None:
-    """Return Spearman's rank correlation between two arrays [T]; ties share a rank. None: an array is constant."""
-    from scipy.stats import spearmanr
-
-    is_constant = np.ptp(first) == 0 or np.ptp(second) == 0
-    return None if is_constant else float(spearmanr(first, second).statistic)
+    if np.ptp(progress) == 0:
+        return None
+    return float(spearmanr(progress, time).statistic), float(kendalltau(progress, time).statistic)
 
 
 def _ranking(numbers: Floats, is_success: npt.NDArray[np.bool_] | None) -> Ranking | None:

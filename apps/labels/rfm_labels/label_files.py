@@ -21,14 +21,12 @@ from rfm_labels.metadata import (
     PROGRESS,
     SUCCESS,
     BlankCameras,
-    Cost,
     blank_from_metadata,
     parsed_object,
     skipping_in,
 )
 from rfm_labels.plan import Plan
 from rfm_labels.writing import (
-    COST_KEY,
     EPISODES_KEY,
     IDENTITY,
     PROGRESS_ENDING,
@@ -116,11 +114,6 @@ def read_label_table(file: Path, *, episode: int | None = None) -> Any:
     return table.select(list(columns.values())).rename_columns(list(columns))
 
 
-def read_cost(file: Path) -> Cost | None:
-    """Return what the labels cost; None: not in the file. Raises DatasetError."""
-    return Cost.parse(_metadata(file).get(COST_KEY))
-
-
 def read_blank(file: Path) -> BlankCameras:
     """Read the blank cameras from a label file's metadata. Raises DatasetError."""
     return blank_from_metadata(_metadata(file))
@@ -153,7 +146,6 @@ def _no_labels(file: Path, error: Exception) -> DatasetError:
 def read_episode_labels(file: Path, episode: int) -> EpisodeLabels | None:
     """Return an episode's labels; None: the file does not have the episode. Raises DatasetError."""
     table = read_label_table(file, episode=episode)
-    require(file, "frame_index" in table.column_names, "the column frame_index", ", ".join(table.column_names))
     if not len(table):
         return None
 
@@ -170,8 +162,9 @@ def read_episode_labels(file: Path, episode: int) -> EpisodeLabels | None:
 
 
 def _score_columns(file: Path, names: Sequence[str]) -> dict[str, str]:
-    """Map the parts' score column names to the file's. Raises DatasetError without progress or ``episode_index``."""
-    require(file, "episode_index" in names, "the column episode_index", ", ".join(names))
+    """Map the parts' score column names to the file's. Raises DatasetError without progress or frame numbers."""
+    for name in IDENTITY[1:]:
+        require(file, name in names, f"the column {name}", ", ".join(names))
     own = next((name for name in _PROGRESS_NAMES if name in names), None)
     signal = next((name for name in names if name.startswith("reward.") and name.endswith(".progress")), None)
     progress = own or signal
@@ -193,18 +186,14 @@ class LabelFile:
 
     provenance: writer, dataset and recipe; empty: another program wrote the labels
     digests: digest by episode number
-    cost: from the last run that scored; None: unknown
-    option: command-line option that chooses another path
     """
 
     path: Path
     provenance: Mapping[str, Any]
     digests: Mapping[int, str]
-    cost: Cost | None
-    option: str
 
     @classmethod
-    def read(cls, path: Path, option: str = "--name") -> LabelFile:
+    def read(cls, path: Path) -> LabelFile:
         """Read what a file's metadata say."""
         metadata: Mapping[bytes, bytes] = {}
         with suppress(DatasetError):
@@ -213,7 +202,7 @@ class LabelFile:
         is_own = str(provenance.get("writer")).startswith("rfm-client") and isinstance(provenance.get("dataset"), dict)
         by_number = parsed_object(metadata.get(EPISODES_KEY)) if is_own else {}
         digests = {int(number): str(digest) for number, digest in by_number.items() if number.isdecimal()}
-        return cls(path, provenance if is_own else {}, digests, Cost.parse(metadata.get(COST_KEY)), option)
+        return cls(path, provenance if is_own else {}, digests)
 
     def check(self, plan: Plan) -> None:
         """Raise DatasetError unless the plan reproduces all labels in the file by the same recipe."""
@@ -228,7 +217,7 @@ class LabelFile:
         got = f"those of {listed(lost)}, too"
         require(self.path, not lost, "labels of the chosen episodes alone", got)
         changed = sorted(number for number, digest in self.digests.items() if planned[number] != digest)
-        got = f"others for {listed(changed)}, whose frames or rows have changed (copied videos: --verify)"
+        got = f"others for {listed(changed)}, whose frames or rows have changed (copy videos with their times: cp -p)"
         require(self.path, not changed, "labels of the episodes as they are now", got)
 
 

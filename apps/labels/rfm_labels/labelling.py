@@ -18,22 +18,13 @@ import numpy as np
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset
 from rfm_labels.datasets.faults import DatasetError
 from rfm_labels.label_files import LabelFile
-from rfm_labels.metadata import PROGRESS, SCORES, Cost, blank_from_metadata, blank_lines
+from rfm_labels.metadata import PROGRESS, SCORES, blank_from_metadata, blank_lines, skipping_in
 from rfm_labels.options import DEFAULTS, QUIET, LabelOptions, Watch
 from rfm_labels.plan import Plan, checked_episodes, plan_labels
 from rfm_labels.scorer import Scorer
 from rfm_labels.scoring import FailedEpisode, Run
 from rfm_labels.summary import Summary, summary_of
-from rfm_labels.writing import (
-    IDENTITY,
-    PROGRESS_ENDING,
-    Parts,
-    is_filled,
-    progress_file,
-    signals_file,
-    with_totals,
-    write_sidecars,
-)
+from rfm_labels.writing import PROGRESS_ENDING, Parts, write_labels
 
 
 @dataclass(frozen=True)
@@ -65,9 +56,8 @@ def label(dataset: Dataset, scorer: Scorer, options: LabelOptions = DEFAULTS, wa
     """
     outputs = Outputs.of(dataset, options)
     plan = planned(dataset, scorer, outputs, watch, writes=True)
-    run = Run(plan, dataset, scorer, outputs.parts, watch)
-    failures = run.finish_all(options.workers)
-    return put_together(plan, dataset, outputs, failures, run.cost, watch)
+    failures = Run(plan, dataset, scorer, outputs.parts, watch).finish_all(options.workers)
+    return put_together(plan, dataset, outputs, failures, watch)
 
 
 def planned(dataset: Dataset, scorer: Scorer, outputs: Outputs, watch: Watch = QUIET, *, writes: bool = False) -> Plan:
@@ -86,7 +76,8 @@ def planned(dataset: Dataset, scorer: Scorer, outputs: Outputs, watch: Watch = Q
             file.check(plan)
         except DatasetError as error:
             if not options.overwrite:
-                problem = f"{error.problem}: choose another {file.option}, or --overwrite"
+                option = "--alias" if file.path in outputs.progress[1:] else "--name"
+                problem = f"{error.problem}: choose another {option}, or --overwrite"
                 raise DatasetError(problem, error.where) from error
             labels = f"its labels of {len(file.digests)} episodes are" if file.digests else "it is"
             watch.note(f"--overwrite: {error}; {labels} replaced")
@@ -95,17 +86,9 @@ def planned(dataset: Dataset, scorer: Scorer, outputs: Outputs, watch: Watch = Q
 
 
 def put_together(
-    plan: Plan,
-    dataset: Dataset,
-    outputs: Outputs,
-    failures: Sequence[FailedEpisode],
-    cost: Cost | None,
-    watch: Watch,
+    plan: Plan, dataset: Dataset, outputs: Outputs, failures: Sequence[FailedEpisode], watch: Watch
 ) -> Report:
-    """Write the label files, unless an episode failed or the run labelled only a shard.
-
-    cost: this run's cost; None: nothing scored, or unknown: keep the cost in existing files
-    """
+    """Write the label files, unless an episode failed or the run labelled only a shard."""
     report = Report([], failures, outputs.parts.url, None, plan)
     if failures or outputs.options.shard is not None:
         return report
@@ -113,13 +96,13 @@ def put_together(
     blank = blank_from_metadata(labels.schema.metadata)
     for line in blank_lines(blank, len(plan.items)):
         watch.note(line)
-    files = outputs.write(plan, labels, cost or outputs.earlier_cost(plan))
+    files = outputs.write(plan, labels)
     for name, score in SCORES.items():
         if name in labels.column_names and (note := score.mark_note(labels[name].to_numpy())):
             watch.note(f"{note}; the column {name} marks them")
-    if outputs.progress and is_filled(labels.column_names, outputs.options.fill):
+    if outputs.progress and skipping_in(labels.column_names):
         skipped = np.isnan(labels[PROGRESS].to_numpy()).sum()
-        watch.note(f"progress_sparse: filled at the {skipped} of {len(labels)} frames that the model skipped (--fill)")
+        watch.note(f"progress_sparse: filled at the {skipped} of {len(labels)} frames that the model skipped")
     num_episodes = len(dataset.numbers)
     if len(plan.items) < num_episodes:
         others = "; LeRobot's reader gives frames of the others the weight 1.0" if outputs.progress else ""
@@ -173,29 +156,12 @@ class Outputs:
 
     def before(self) -> list[LabelFile]:
         """Return the existing label files."""
-        named = zip(self.progress, ("--name", "--alias"), strict=False)
-        found = [LabelFile.read(path, option) for path, option in named if path.exists()]
-        return found + [LabelFile.read(path) for path in self.signals if path.exists()]
+        return [LabelFile.read(path) for path in (*self.progress, *self.signals) if path.exists()]
 
-    def earlier_cost(self, plan: Plan) -> Cost | None:
-        """Return the cost that existing files record for these labels; None: unknown."""
-        digests = {item.digest for item in plan.items}  # another recipe gives other digests
-        known = (file.cost for file in self.before() if digests & set(file.digests.values()))
-        return next(filter(None, known), None)
-
-    def write(self, plan: Plan, labels: Any, cost: Cost | None) -> list[Path]:
-        """Write the labels to all files, and return their paths. Raises OSError.
-
-        labels: table from ``Parts.read_all``
-        cost: for the metadata; None: unknown
-        """
-        columns = [name for name in labels.column_names if name not in IDENTITY]
-        fill = self.options.fill
-        sidecars = [progress_file(path, plan, columns, cost, fill) for path in self.progress]
-        sidecars += [signals_file(path, plan, columns, self.options.name, cost) for path in self.signals]
+    def write(self, plan: Plan, labels: Any) -> list[Path]:
+        """Write the labels, a table from ``Parts.read_all``, to all files, and return their paths. Raises OSError."""
         try:
-            write_sidecars(with_totals(labels, plan, fill), sidecars)
+            return write_labels(labels, plan, self.progress, self.signals, self.options.name)
         except OSError as error:
             remedy = f"make room, or name another folder with --output and this one's --parts {self.parts.url}"
             raise OSError(f"{self.folder}: expected to write the labels, got {error}: {remedy}") from error
-        return [sidecar.path for sidecar in sidecars]

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Label file metadata: score names, JSON, the run's cost, and which cameras are blank in which episodes."""
+"""Label file metadata: score names, JSON, and which cameras are blank in which episodes."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
 from typing import Any, TypeAlias
 
 from rfm_client import FRAME_SCORES, Float32Array
@@ -19,39 +18,6 @@ BlankCameras: TypeAlias = Mapping[str, Mapping[int, int]]  # brightest value, by
 BLANK_KEY = b"rfm.blank_cameras"
 
 _MOST_LISTED = 12  # episode ranges per line
-
-
-@dataclass(frozen=True)
-class Cost:
-    """What the last scoring run for a label file cost.
-
-    A run counts only frames that it scored itself: none from earlier runs or other processes. Seconds include decoding,
-    but not loading the checkpoint.
-
-    frames: rows in the label file; a frame seen by several cameras counts once
-    """
-
-    frames: int
-    seconds: float
-
-    @classmethod
-    def parse(cls, text: bytes | str | None) -> Cost | None:
-        """Parse the cost in a label file's metadata; None if it is missing or invalid."""
-        try:
-            content = json.loads(text or b"")
-            cost = cls(int(content["frames"]), float(content["seconds"]))
-        except (ValueError, TypeError, KeyError, OverflowError):
-            return None
-        return cost if cost.frames > 0 and cost.seconds > 0 else None
-
-    def json(self) -> bytes:
-        """Return JSON text for the metadata."""
-        return json.dumps(asdict(self)).encode()
-
-    @property
-    def frames_per_s(self) -> float:
-        """Dataset frames labelled per second."""
-        return self.frames / self.seconds
 
 
 def skipping_in(names: Iterable[str]) -> str | None:

@@ -9,9 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias, get_args
 
-from rfm_client import (
-    RewardError,
-)
+from rfm_client import RewardError
 from rfm_client.frames import Fuse, Rule
 from rfm_client.options import ConfigError, InvalidValueError, Settings, checked_count, setting
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
@@ -19,7 +17,6 @@ from rfm_labels.datasets.faults import listed, require
 
 Mode: TypeAlias = Literal["prefix", "whole"]
 ProgressRule: TypeAlias = Literal["remaining_over_first"]
-Fill: TypeAlias = Literal["linear", "none"]
 Format: TypeAlias = Literal["progress", "signals"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 DEFAULT_WORKERS = 4
@@ -125,11 +122,6 @@ class LabelOptions(Settings):
         "How progress is made of remaining seconds, for a model without progress: "
         "remaining_over_first: 1 - the seconds / those of the episode's first frame.",
     )
-    fill: Fill = setting(
-        "linear",
-        "progress_sparse at frames that the model skipped. linear: on the line between its answers, as LeRobot's "
-        "--stride does. none: NaN.",
-    )
     mode: Mode = setting("prefix", "prefix: frame t is scored on the frames up to t. whole: all frames together.")
     resize: bool = setting(False, "Downscale frames to the model's input size before sending.")
     episodes: Sequence[int] | None = setting(
@@ -154,7 +146,6 @@ class LabelOptions(Settings):
     overwrite: bool = setting(
         False, "Replace label files even if this run does not reproduce all their labels by the same recipe."
     )
-    verify: bool = setting(False, "Detect changed videos by SHA-256 instead of size and mtime.")
 
     def __post_init__(self) -> None:
         for name in ("episodes", "shard"):

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import itertools
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,7 +12,16 @@ from pathlib import Path
 from typing import Any, get_args
 
 from rfm_client import InvalidSampleError, RewardError, UInt8Array
-from rfm_client.frames import ChannelOrder, Correction, FrameFileError, Fuse, Orientation, Picture, Sampling
+from rfm_client.frames import (
+    ChannelOrder,
+    Correction,
+    FrameFileError,
+    Fuse,
+    Orientation,
+    Picture,
+    Sampling,
+    resize_frames,
+)
 from rfm_client.options import InvalidValueError, first_names
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.datasets.faults import FaultsError, listed, require
@@ -22,7 +30,6 @@ from rfm_labels.options import LAST, QUIET, LabelOptions, Mode, ProgressRule, Wa
 from rfm_labels.scorer import CheckpointFacts, Scorer
 
 _RECIPE_FORMAT = 4  # increase when the same recipe gives other scores or other digests
-_OPTIONAL = ("progress_rule",)  # omit when empty: older labels have no such field
 _SAMPLING_REASONS = {True: "as upstream's training pads shorter clips", False: "the checkpoint's training did not pad"}
 _FRAMES_REASON = "the most in training; if the checkpoint does not say, the most its network takes"
 
@@ -69,7 +76,6 @@ class Recipe:
     views: further cameras, shown beside the single entry in ``cameras``
     decoders: library and version that decode each camera, since colours differ between versions; None: stored as pixels
     corrections: for cameras whose frames are turned, or stored as BGR
-    verify: True: identify videos by content
     progress_rule: derives progress from remaining seconds; None: the checkpoint predicts progress
     """
 
@@ -81,7 +87,6 @@ class Recipe:
     mode: Mode
     fuse: Fuse
     resize: bool
-    verify: bool
     progress_rule: ProgressRule | None = None
     views: tuple[str, ...] = ()
     goal: Goal | None = None
@@ -119,7 +124,6 @@ class Recipe:
             mode=options.mode,
             fuse=options.fuse,
             resize=options.resize,
-            verify=options.verify,
             progress_rule=options.progress_rule,
             views=views,
             goal=None if options.goal is None else Goal.of(options.goal),
@@ -140,6 +144,11 @@ class Recipe:
         """Stored channel order by camera, for cameras that do not store RGB."""
         return {camera: each.channels for camera, each in self.corrections.items() if each.channels != "rgb"}
 
+    def resized(self, frames: UInt8Array) -> UInt8Array:
+        """Return frames, uint8 [T, H, W, 3], in the size in which they are sent."""
+        size = self.checkpoint.frame_size if self.resize else None
+        return frames if size is None else resize_frames(frames, size)
+
     def in_one_pass(self, num_frames: int) -> bool:
         """True if one pass over ``num_frames`` frames scores every frame."""
         rule, frames = self.sampling.rule, self.sampling.frames
@@ -148,21 +157,24 @@ class Recipe:
 
     def document(self) -> dict[str, Any]:
         """Return the recipe for the provenance."""
+        newer = {  # omitted when empty: older labels have no such field
+            "channels": dict(self.channels),
+            "progress_rule": self.progress_rule,
+            "views": list(self.views),
+            "goal": self.goal and self.goal.document(),
+        }
         return {
             "format": _RECIPE_FORMAT,
             "checkpoint": self.checkpoint.document(),
             "cameras": list(self.cameras),
             "decoders": dict(self.decoders),
             "orientations": dict(self.orientations),
-            **({"channels": dict(self.channels)} if self.channels else {}),  # older labels have no such field
             "sampling": asdict(self.sampling),
             "mode": self.mode,
             "fuse": self.fuse if len(self.cameras) > 1 else None,
             "resize": str(self.checkpoint.frame_size) if self.resize else None,
-            "verify": self.verify,
-            **{name: value for name in _OPTIONAL if (value := getattr(self, name))},
-            **({"views": list(self.views)} if self.views else {}),
-            **({} if self.goal is None else {"goal": self.goal.document()}),
+            "verify": False,  # of older labels: True for videos identified by content
+            **{name: value for name, value in newer.items() if value},
         }
 
     def explanation(self, options: LabelOptions) -> list[str]:
@@ -253,7 +265,7 @@ def make_plan(dataset: Dataset, recipe: Recipe, episodes: Iterable[DatasetEpisod
     for episode in episodes:
         about = f"{episode.index} {episode.first_index} {episode.num_frames} {episode.task}"
         about += f" {episode.tasks}" if episode.tasks else ""
-        videos = [f"{each} {dataset.identity(episode, each, verify=recipe.verify)}" for each in recipe.decoded_cameras]
+        videos = [f"{each} {dataset.identity(episode, each)}" for each in recipe.decoded_cameras]
         items.append(Item(episode, digest_of(part.encode() for part in (document, about, *videos))))
     return Plan(items, recipe, {"kind": dataset.kind, "source": dataset.source, "revision": dataset.revision})
 
@@ -298,7 +310,11 @@ def checked_episodes(
     for number in numbers:
         try:
             episode = dataset.episode(number)
-            check_order([*episodes[-1:], episode])
+            for before in episodes[-1:]:
+                end = before.first_index + before.num_frames
+                expected = f"{end} or more, since {before.name} ends at {end - 1}"
+                got = f"{episode.first_index}: renumber the rows in the order of the episodes"
+                require(f"{episode.name}: index", episode.first_index >= end, expected, got)
             for camera in () if tables_only else dict.fromkeys((*cameras, *views)):
                 dataset.check(episode, camera)
             episodes.append(episode)
@@ -323,15 +339,6 @@ def all_faults(dataset: Dataset, options: LabelOptions) -> Iterator[None]:
     except RewardError:
         checked_episodes(dataset, options)
         raise
-
-
-def check_order(episodes: Sequence[DatasetEpisode]) -> None:
-    """Raise DatasetError if two episodes share rows, or the rows do not follow episode order."""
-    for before, episode in itertools.pairwise(episodes):
-        end = before.first_index + before.num_frames
-        got = f"{episode.first_index}: renumber the rows in the order of the episodes"
-        expected = f"{end} or more, since {before.name} ends at {end - 1}"
-        require(f"{episode.name}: index", episode.first_index >= end, expected, got)
 
 
 def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch = QUIET) -> Plan:
@@ -374,16 +381,10 @@ def _task_lines(dataset: Dataset, episodes: Sequence[DatasetEpisode]) -> list[st
     elif given.text is not None:
         num_given = sum(any(task == given.text for task, _ in episode.stretches) for episode in episodes)
         lines.append(f"tasks: {len(episodes) - num_given} episodes keep their own sentence, {num_given} get --task")
-    return lines + _identifier_lines(task for episode in episodes for task, _ in episode.stretches)
-
-
-def _identifier_lines(tasks: Iterable[str]) -> list[str]:
-    """Return a line that lists single-word ASCII tasks, such as ``pick_place_cup``; empty if there are none."""
-    known = dict.fromkeys(tasks)
-    found = [task for task in known if task.isascii() and len(task.split()) == 1]
-    if not found:
-        return []
-    remedy = "--task with --override-task gives all episodes a sentence, --task-column reads another column (LeRobot)"
-    return [
-        f"tasks: {len(found)} of {len(known)} are a single word, not a sentence ({first_names(found, 3)}); {remedy}"
-    ]
+    known = dict.fromkeys(task for episode in episodes for task, _ in episode.stretches)
+    words = [task for task in known if task.isascii() and len(task.split()) == 1]  # such as ``pick_place_cup``
+    if words:
+        what = f"{len(words)} of {len(known)} are a single word, not a sentence ({first_names(words, 3)})"
+        remedy = "--task with --override-task gives all episodes a sentence"
+        lines.append(f"tasks: {what}; {remedy}, --task-column reads another column (LeRobot)")
+    return lines

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -35,11 +34,10 @@ from rfm_client import (
     Trajectory,
     UInt8Array,
 )
-from rfm_client.frames import BlankFrames, resize_frames
+from rfm_client.frames import BlankFrames
 from rfm_client.options import InvalidValueError
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
-from rfm_labels.datasets.faults import require
-from rfm_labels.metadata import SCORES, Columns, Cost
+from rfm_labels.metadata import SCORES, Columns
 from rfm_labels.options import Watch
 from rfm_labels.plan import Item, Plan, Recipe
 from rfm_labels.scorer import DECISIVE, Scorer
@@ -74,12 +72,6 @@ class Run:
         self._lock = threading.Lock()
         self._failures: list[FailedEpisode] = []
         self._cause: Exception | None = None
-        self._frames_scored, self._seconds = 0, 0.0
-
-    @property
-    def cost(self) -> Cost | None:
-        """The frames that ``finish_all`` scored, and the time taken; None: scored nothing."""
-        return Cost(self._frames_scored, self._seconds) if self._frames_scored else None
 
     def finish_all(self, workers: int) -> list[FailedEpisode]:
         """Label all items without a part, ``workers`` at a time, and return the failures.
@@ -87,7 +79,6 @@ class Run:
         Raises RewardError if the server is gone, OSError if the disk is full, after the current episodes have ended.
         """
         pending = unfinished(self._plan, self._parts, self._watch)
-        began_s = time.monotonic()
         with ThreadPoolExecutor(workers, thread_name_prefix="rfm-label") as pool:
             try:
                 list(pool.map(self._label, pending))
@@ -95,10 +86,9 @@ class Run:
                 self._stopping.set()
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
-        self._seconds = time.monotonic() - began_s
         if self._cause is not None:
             raise self._cause
-        return by_episode(self._failures)
+        return sorted(self._failures, key=lambda failure: failure.episode.index)
 
     def _label(self, item: Item) -> None:
         try:
@@ -122,14 +112,14 @@ class Run:
     def _score(self, item: Item) -> None:
         recipe, memory = self._plan.recipe, self._memory
         try:
-            scores = episode_scores(self._dataset, item.episode, self._scorer, recipe, memory=memory, go_on=self._go_on)
+            columns, blank = episode_scores(
+                self._dataset, item.episode, self._scorer, recipe, memory=memory, go_on=self._go_on
+            )
         except InferenceFailedError:  # perhaps another checkpoint is served now
             self._check_checkpoint()
             raise
         self._check_checkpoint()
-        self._parts.write(item, scores.columns, scores.blank)
-        with self._lock:
-            self._frames_scored += item.episode.num_frames
+        self._parts.write(item, columns, blank)
 
     def _check_checkpoint(self) -> None:
         """Stop the run and raise _StoppedError if the server now has another checkpoint."""
@@ -157,23 +147,6 @@ def unfinished(plan: Plan, parts: Parts, watch: Watch) -> list[Item]:
     finished = parts.finished(plan.items)
     watch.begin(plan.num_frames, sum(item.episode.num_frames for item in plan.items if item.key in finished))
     return [item for item in plan.items if item.key not in finished]
-
-
-def by_episode(failures: Sequence[FailedEpisode]) -> list[FailedEpisode]:
-    """Return the failures in episode order."""
-    return sorted(failures, key=lambda failure: failure.episode.index)
-
-
-@dataclass(frozen=True, eq=False)
-class EpisodeScores:
-    """The scores for one episode.
-
-    columns: label columns, float32 [T] each
-    blank: brightest value for each camera that shows nothing, as in ``BlankFrames``
-    """
-
-    columns: Columns
-    blank: Mapping[str, int]
 
 
 class FrameMemory:
@@ -209,8 +182,8 @@ def episode_scores(
     *,
     memory: FrameMemory,
     go_on: Callable[[], None],
-) -> EpisodeScores:
-    """Return an episode's scores and blank cameras. Raises RewardError.
+) -> tuple[Columns, dict[str, int]]:
+    """Return an episode's label columns, float32 [T] each, and each blank camera's brightest value. Raises RewardError.
 
     Columns: ``progress``, and every other score in ``SCORES`` that the checkpoint gives; a mark is 1 if it is 1 for any
     camera. Several cameras add ``progress.<camera>`` and so on.
@@ -223,9 +196,7 @@ def episode_scores(
     by_camera: dict[str, list[ProgressResult]] = {}
     shown = {camera: BlankFrames() for camera in recipe.decoded_cameras}
     for camera in recipe.cameras:
-        together = [
-            _checked(dataset.frames(episode, each), episode, each, shown[each]) for each in (camera, *recipe.views)
-        ]
+        together = [_noted(dataset.frames(episode, each), shown[each]) for each in (camera, *recipe.views)]
         for number, (task, count) in enumerate(episode.stretches, 1):
             is_last = number == len(episode.stretches)  # reads on, to detect surplus frames
             stretch = together if is_last else [itertools.islice(frames, count) for frames in together]
@@ -239,7 +210,7 @@ def episode_scores(
             by_camera.setdefault(camera, []).append(result)
     highest = {camera: frames.highest for camera, frames in shown.items()}
     blank = {camera: value for camera, value in highest.items() if value is not None}
-    return EpisodeScores(_columns(by_camera, episode, recipe), blank)
+    return _columns(by_camera, episode, recipe), blank
 
 
 def _columns(by_camera: Mapping[str, Sequence[ProgressResult]], episode: DatasetEpisode, recipe: Recipe) -> Columns:
@@ -263,16 +234,12 @@ def _columns(by_camera: Mapping[str, Sequence[ProgressResult]], episode: Dataset
 def _scores(trajectory: Trajectory, scorer: Scorer, recipe: Recipe, go_on: Callable[[], None]) -> ProgressResult:
     if recipe.in_one_pass(trajectory.num_frames):
         (result,) = scorer.evaluate([ProgressSample(trajectory)])
-        return _with_progress(result, recipe)
-    results: list[ProgressResult] = []
-    for together in _by_bytes(recipe.sampling.samples(trajectory)):
-        go_on()
-        results += scorer.evaluate(together)
-    return _with_progress(recipe.sampling.joined(results), recipe)
-
-
-def _with_progress(result: ProgressResult, recipe: Recipe) -> ProgressResult:
-    """Derive progress by the recipe's rule, if it has one. Raises InvalidSampleError."""
+    else:
+        results: list[ProgressResult] = []
+        for together in _by_bytes(recipe.sampling.samples(trajectory)):
+            go_on()
+            results += scorer.evaluate(together)
+        result = recipe.sampling.joined(results)
     if recipe.progress_rule is None:
         return result
     try:
@@ -285,10 +252,7 @@ def _shrunk(frames: Iterator[UInt8Array], recipe: Recipe, go_on: Callable[[], No
     """Yield arrays with at most FRAMES_AT_A_TIME frames, resized if the recipe says so."""
     while chunk := list(itertools.islice(frames, FRAMES_AT_A_TIME)):
         go_on()
-        stacked = np.stack(chunk)
-        if recipe.resize and recipe.checkpoint.frame_size is not None:
-            stacked = resize_frames(stacked, recipe.checkpoint.frame_size)
-        yield stacked
+        yield recipe.resized(np.stack(chunk))
 
 
 def _joined(parts: Sequence[Trajectory]) -> Trajectory:
@@ -301,9 +265,7 @@ def _held(
 ) -> Trajectory:
     """Return a trajectory for camera and views, given each one's first chunk and an iterator over the rest."""
     frames, *views = (_filled(first, chunks, count) for first, chunks in zip(firsts, others, strict=True))
-    goal = None if recipe.goal is None else recipe.goal.picture(frames)
-    if goal is not None and recipe.resize and recipe.checkpoint.frame_size is not None:
-        (goal,) = resize_frames(goal[np.newaxis], recipe.checkpoint.frame_size)
+    goal = None if recipe.goal is None else recipe.resized(recipe.goal.picture(frames)[np.newaxis])[0]
     return Trajectory(frames=frames, task=task, views=tuple(views), goal=goal)
 
 
@@ -330,19 +292,11 @@ def _by_bytes(samples: Iterable[ProgressSample]) -> Iterator[list[ProgressSample
         yield together
 
 
-def _checked(
-    frames: Iterator[UInt8Array], episode: DatasetEpisode, camera: str, shown: BlankFrames
-) -> Iterator[UInt8Array]:
-    """Yield frames and record them in ``shown``. Raises DatasetError if their count is wrong or sizes differ."""
-    where, count, shape = f"{episode.name}: {camera}", 0, None
+def _noted(frames: Iterator[UInt8Array], shown: BlankFrames) -> Iterator[UInt8Array]:
+    """Yield the frames, and record them in ``shown``."""
     for frame in frames:
-        shape = shape or frame.shape
-        require(f"{where}: frame {count}", frame.shape == shape, f"the size {shape}", frame.shape)
-        count += 1
-        if count <= episode.num_frames:
-            shown.add(frame)
-            yield frame
-    require(where, count == episode.num_frames, f"{episode.num_frames} frames", count)
+        shown.add(frame)
+        yield frame
 
 
 def _check_numbers(

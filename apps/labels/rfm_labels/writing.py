@@ -8,7 +8,7 @@ everything that decides the labels, so any run may reuse the part.
 Columns: int64 ``index``, ``episode_index``, ``frame_index``, then float32 ``progress_sparse``, ``success``, and one set
 per camera. If an episode has several tasks, ``progress`` restarts with each task, and ``progress_sparse`` adds up the
 gains. If the model skips frames, ``progress`` is NaN there, and
-``progress_sparse`` is interpolated (NaN with ``--fill none``).
+``progress_sparse`` is interpolated.
 
 ``reward_signals/<name>.parquet``: LeRobot's frame signals (schema version 1), as its open pull requests propose them.
 Columns: the same int64 columns, then float32 ``reward.<name>.progress``, ``reward.<name>.success_probability``, and one
@@ -22,9 +22,8 @@ import os
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -36,13 +35,11 @@ from rfm_labels.metadata import (
     SCORES,
     SUCCESS,
     Columns,
-    Cost,
     blank_from_metadata,
     blank_to_metadata,
     canonical_json,
     skipping_in,
 )
-from rfm_labels.options import Fill
 from rfm_labels.plan import Item, Plan
 
 IDENTITY = ("index", "episode_index", "frame_index")  # columns in every label table
@@ -50,14 +47,15 @@ PROGRESS_ENDING = "_progress.parquet"
 PROVENANCE_KEY = b"rfm.provenance"
 SIGNALS_PROVENANCE_KEY = b"lerobot.reward_scoring.provenance"
 EPISODES_KEY = b"rfm.episodes"  # digest per episode: a later run compares them to see whether the labels still hold
-FILL_KEY = b"rfm.progress_sparse_fill"  # how skipped frames were filled; absent if the model skipped none
-COST_KEY = b"rfm.cost"  # not in the provenance, which must be equal for equal runs
+FILL_KEY = b"rfm.progress_sparse_fill"  # absent if the model skipped no frame
 SIGNAL_NAMES = {**{name: name for name in SCORES}, SUCCESS: "success_probability", REMAINING: "remaining_time_s"}
 _POTENTIAL, _IS_SCORED = "potential", "is_inference_frame"
 _DERIVED = {  # further signals and what they mean
     _POTENTIAL: "Minus the remaining seconds",
     _IS_SCORED: "1 where the model scored the frame itself",
 }
+
+Form: TypeAlias = tuple[Mapping[str, str], Mapping[bytes, bytes]]  # a file's columns by part column, and its metadata
 
 _DIGEST_KEY = b"rfm.digest"
 _SUFFIX = ".parquet"
@@ -99,7 +97,7 @@ class Parts:
     def write(self, item: Item, columns: Columns, blank: Mapping[str, int]) -> None:
         """Write the item's part atomically. Raises OSError.
 
-        columns, blank: as in ``EpisodeScores``
+        columns, blank: as ``episode_scores`` returns them
         """
         import pyarrow as pa
         from pyarrow import parquet
@@ -149,11 +147,11 @@ class Parts:
         blank: dict[str, dict[int, int]] = {}
         following = -1
         for item in plan.items:
-            table, name, first = self.read(item), item.episode.name, item.episode.first_index
-            names = (tables or [table])[0].column_names
-            require(name, table.column_names == names, f"the columns {', '.join(names)}", ", ".join(table.column_names))
-            require(name, first > following, f"rows after {following}", first)
+            table, first = self.read(item), item.episode.first_index
+            require(item.episode.name, first > following, f"rows after {following}", first)
             following = first + item.episode.num_frames - 1
+            names, own = (tables or [table])[0].column_names, table.column_names
+            require(item.episode.name, own == names, f"the columns {', '.join(names)}", ", ".join(own))
             for camera, highest in blank_from_metadata(table.schema.metadata).items():
                 blank.setdefault(camera, {}).update(highest)
             tables.append(table.replace_schema_metadata(None))
@@ -191,49 +189,24 @@ def whole_files(*targets: Path) -> Iterator[list[Path]]:
             file.unlink(missing_ok=True)
 
 
-@dataclass(frozen=True)
-class Sidecar:
-    """A Parquet label file to write.
-
-    columns: maps column names in the parts to column names in the file
-    metadata: for the Parquet schema
-    """
-
-    path: Path
-    columns: Mapping[str, str]
-    metadata: Mapping[bytes, bytes]
-
-
-def progress_file(path: Path, plan: Plan, columns: Sequence[str], cost: Cost | None, fill: Fill) -> Sidecar:
-    """Return the progress file for these part columns.
-
-    cost: None: unknown
-    fill: as in ``LabelOptions``
-    """
+def _progress_form(plan: Plan, columns: Sequence[str]) -> Form:
+    """The form of a progress file with these part columns."""
     checkpoint = plan.recipe.checkpoint
     model = checkpoint.source or checkpoint.weights_digest
     metadata = {
         b"reward_model_path": (f"{model}@{checkpoint.revision}" if checkpoint.revision else model).encode(),
         PROVENANCE_KEY: canonical_json(plan.provenance()),
-        **_of_run(plan, cost),
     }
     named = {name: name for name in columns}
-    if is_filled(columns, fill):
-        metadata[FILL_KEY] = fill.encode()
-    if is_filled(columns, fill) or _has_several_tasks(plan):
-        return Sidecar(path, {_TOTAL: "progress_sparse", **named}, metadata)
-    return Sidecar(path, {**named, PROGRESS: "progress_sparse"}, metadata)
+    if skipping_in(columns):
+        metadata[FILL_KEY] = b"linear"
+    if skipping_in(columns) or _has_several_tasks(plan):
+        return {_TOTAL: "progress_sparse", **named}, metadata
+    return {**named, PROGRESS: "progress_sparse"}, metadata
 
 
-def is_filled(columns: Sequence[str], fill: Fill) -> bool:
-    """True if the model skipped frames and ``progress_sparse`` is filled there. columns: from the parts."""
-    return fill == "linear" and skipping_in(columns) is not None
-
-
-def with_totals(labels: Any, plan: Plan, fill: Fill) -> Any:
-    """Return the labels with all columns that the label files need.
-
-    labels: table from ``Parts.read_all``; fill: as in ``LabelOptions``
+def _with_totals(labels: Any, plan: Plan) -> Any:
+    """Return the labels, a table from ``Parts.read_all``, with all columns that the label files need.
 
     Reward-aligned behaviour cloning weights a frame by the progress between two frames, or 0 if progress falls.
     Progress restarts when an episode's task changes, so ``progress_sparse`` sums the gains over all tasks. A frame
@@ -250,7 +223,7 @@ def with_totals(labels: Any, plan: Plan, fill: Fill) -> Any:
         derived[_IS_SCORED] = np.isfinite(labels[skipping].to_numpy()).astype(np.float32)
     for name, values in derived.items():
         labels = labels.append_column(name, pa.array(values))
-    if not (is_filled(labels.column_names, fill) or _has_several_tasks(plan)):
+    if not (skipping or _has_several_tasks(plan)):
         return labels
     progress = labels[PROGRESS].to_numpy()
     total, begin = progress.copy(), 0
@@ -260,7 +233,7 @@ def with_totals(labels: Any, plan: Plan, fill: Fill) -> Any:
             own = slice(begin + first, end)
             begun = np.nan_to_num(progress[own.start])  # NaN before the first answer if the model compares frames
             total[own] = progress[own] - begun + total[own.start - 1]
-        if is_filled(labels.column_names, fill):
+        if skipping:
             total[begin:end] = _filled(total[begin:end])
         begin = end
     return labels.append_column(_TOTAL, pa.array(total))
@@ -281,8 +254,8 @@ def _has_several_tasks(plan: Plan) -> bool:
     return any(item.episode.tasks for item in plan.items)
 
 
-def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str, cost: Cost | None) -> Sidecar:
-    """Return the frame signal file for these part columns. cost: None: unknown."""
+def _signals_form(plan: Plan, columns: Sequence[str], name: str) -> Form:
+    """The form of a frame signal file with these part columns."""
     signals = {}
     for column in columns:
         score, dot, camera = column.partition(".")
@@ -301,13 +274,7 @@ def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str, cost
     }
     ordered = dict(sorted(signals.items(), key=lambda signal: signal[1]))
     named = {f"lerobot.reward_scoring.{key}".encode(): value for key, value in metadata.items()}
-    return Sidecar(path, ordered, {**named, **_of_run(plan, cost)})
-
-
-def _of_run(plan: Plan, cost: Cost | None) -> dict[bytes, bytes]:
-    """Return the metadata that both formats share."""
-    digests = {EPISODES_KEY: canonical_json(plan.digests())}
-    return digests if cost is None else {**digests, COST_KEY: cost.json()}
+    return ordered, named
 
 
 def _descriptor(column: str, skipping: str | None) -> dict[str, Any]:
@@ -326,28 +293,34 @@ def _descriptor(column: str, skipping: str | None) -> dict[str, Any]:
     }
 
 
-def write_sidecars(labels: Any, sidecars: Sequence[Sidecar]) -> None:
-    """Write the labels to new files, read them back, then move them into place one by one.
+def write_labels(labels: Any, plan: Plan, progress: Sequence[Path], signals: Sequence[Path], name: str) -> list[Path]:
+    """Write the labels to new files, read them back, then move them into place one by one. Return all paths.
 
     labels: table from ``Parts.read_all``
+    progress, signals: files in each format
+    name: reward name, in the signals' column names
 
     Raises OSError if a write fails or a file reads back differently; existing files then stay unchanged.
     """
     import pyarrow as pa
     from pyarrow import parquet
 
-    for sidecar in sidecars:
-        sidecar.path.parent.mkdir(parents=True, exist_ok=True)
-    with whole_files(*(sidecar.path for sidecar in sidecars)) as files:
-        for file, sidecar in zip(files, sidecars, strict=True):
-            own = labels.select([*IDENTITY, *sidecar.columns])
-            own = own.rename_columns([*IDENTITY, *sidecar.columns.values()])
+    columns = [each for each in labels.column_names if each not in IDENTITY]
+    forms = [(path, _progress_form(plan, columns)) for path in progress]
+    forms += [(path, _signals_form(plan, columns, name)) for path in signals]
+    shared = {EPISODES_KEY: canonical_json(plan.digests()), **(labels.schema.metadata or {})}
+    labels = _with_totals(labels, plan)
+    for path, _ in forms:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_files(*(path for path, _ in forms)) as files:
+        for file, (path, (named, metadata)) in zip(files, forms, strict=True):
+            own = labels.select([*IDENTITY, *named]).rename_columns([*IDENTITY, *named.values()])
             fields = [pa.field(field.name, field.type, nullable=False) for field in own.schema]
-            schema = pa.schema(fields, metadata={**sidecar.metadata, **(labels.schema.metadata or {})})
-            table = own.cast(schema)
+            table = own.cast(pa.schema(fields, metadata={**metadata, **shared}))
             parquet.write_table(table, file, row_group_size=_ROWS_AT_A_TIME)
             if not _holds(file, table):
-                raise OSError(f"{sidecar.path}: expected the labels that were written, read others")
+                raise OSError(f"{path}: expected the labels that were written, read others")
+    return [path for path, _ in forms]
 
 
 def _holds(file: Path, table: Any) -> bool:

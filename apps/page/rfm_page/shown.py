@@ -91,7 +91,7 @@ class ShownDataset:
 
     def mp4(self, episode: DatasetEpisode, camera: str, take: Callable[[int], object]) -> bytes:
         """Return an episode's video as an MP4 file. take: see ``video``"""
-        return encoded(self.dataset.stored_frames(episode, camera), self.fps, take)
+        return encoded(self.dataset.whole_frames(episode, camera), self.fps, take)
 
     def read(self, reading: Callable[[ShownDataset], Read]) -> Read:
         """Check the dataset, then read from it. Raises HTTPException 500 with the fault of a broken dataset."""

@@ -49,7 +49,7 @@ _ALL = np.ones(1, np.bool_)
 _REMEDY = "call reset, or wrap the RewardModelWrapper in gymnasium.wrappers.Autoreset"
 _UNBATCH = (
     "ManiSkill: RewardModelVectorWrapper(ManiSkillVectorEnv(env), ...), or CPUGymWrapper(env) if there is one; "
-    "Isaac Lab never shows an episode's last frame: score its frames with client.episodes(num_envs, task)"
+    "Isaac Lab never shows an episode's last frame: score its frames with client.score_episodes(episodes)"
 )
 
 

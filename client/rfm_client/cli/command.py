@@ -10,17 +10,22 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING
 from enum import IntEnum
-from typing import Annotated, Any, Generic, NoReturn, TypeVar, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Generic, TypeVar, get_args, get_origin
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.models import OptionInfo
 
-from rfm_client.cli.messages import UsageError, argument_name, in_plain_words, user_message, write_options
 from rfm_client.contract import errors
 from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, placeholder_of
+from rfm_client.contract.triton import FEWER_FRAMES
 
 STANDARD_OUTPUT = "-"
+MOST_COLUMNS = 110  # widest help text, if the terminal is that wide
+
+_FIRST, _LAST = ("Arguments", "Options"), ("Server", "Credentials")  # sections in a help text
+UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # from click, or from typer's own copy of click
+_EXPECTED = {"int_parsing": "a whole number", "int_from_float": "a whole number", "float_parsing": "a number"}
 
 S = TypeVar("S", bound=Settings)
 
@@ -92,25 +97,16 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 class Command(TyperCommand):
-    """A command with a help section for each option group, and one-line errors without traceback.
-
-    ``--json`` may stand without a value.
-    """
+    """A command with a help section for each option group, and one-line errors without traceback."""
 
     program = "rfm-client"
     has_codes = True  # False: every error exits with 1
     unknown_option = ""  # added to the error about an unknown {option}
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Give ``--json`` without a value the value ``-``, which the parser cannot do. Raises typer.BadParameter."""
-        completed: list[str] = []
-        for index, word in enumerate(args):
-            completed.append(word)
-            following = args[index + 1] if index + 1 < len(args) else "--"
-            if word == "--json" and following.startswith("-") and following != STANDARD_OUTPUT:
-                completed.append(STANDARD_OUTPUT)
+        """Parse the words. Raises typer.BadParameter in the command line's words."""
         try:
-            return super().parse_args(ctx, completed)
+            return super().parse_args(ctx, args)
         except typer.BadParameter as error:
             error.message = in_plain_words(error)
             raise
@@ -150,19 +146,6 @@ class Command(TyperCommand):
 class CommandGroup(TyperGroup):
     """Lists the commands before the options in the help."""
 
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words before the command. An error about a command's option says where to put the option."""
-        try:
-            return super().parse_args(ctx, args)
-        except UsageError as error:
-            option = vars(error).get("option_name", "")
-            owners = [name for name, each in self.commands.items() if any(option in one.opts for one in each.params)]
-            if owners:
-                vars(error)["message"] += (
-                    f": it stands after the command, as in {ctx.command_path} {owners[0]} {option}"
-                )
-            raise
-
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the commands, then the options."""
         self.format_commands(ctx, formatter)
@@ -170,15 +153,27 @@ class CommandGroup(TyperGroup):
 
 
 class Commands(CommandGroup):
-    """The ``rfm-client`` commands. Names the right program if a command belongs to the other one."""
+    """The ``rfm-client`` commands.
 
-    other_program = "rfm"
-    others: Collection[str] = ("export", "serve", "try", "models")
+    elsewhere: commands of the other program
+    missing: by command of an application that is not installed, how to install it
+    """
+
+    program, other_program = "rfm-client", "rfm"
+    elsewhere: Collection[str] = ("export", "serve", "try", "models")
+    missing: ClassVar[dict[str, str]] = {
+        **dict.fromkeys(("evaluate", "label"), "pip install ./client ./apps/labels"),
+        "gateway": "pip install ./client ./apps/gateway",
+    }
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command. Raises a usage error with the right name, or the program that has the command."""
-        if args[0] in self.others and self.get_command(ctx, args[0]) is None:
-            ctx.fail(f"No such command '{args[0]}': that is `{self.other_program} {args[0]}`")
+        """Find the command. Raises a usage error that names the right program, typer.Exit if a package is missing."""
+        name = args[0]
+        if self.get_command(ctx, name) is None and name in self.elsewhere:
+            ctx.fail(f"No such command '{name}': that is `{self.other_program} {name}`")
+        if self.get_command(ctx, name) is None and name in self.missing:
+            report(f"{name}: expected its package, got none: {self.missing[name]}", self.program)
+            raise typer.Exit(ExitCode.FAILED)
         return super().resolve_command(ctx, args)
 
 
@@ -198,12 +193,6 @@ def exit_code_of(failures: Sequence[Exception], *, some_succeeded: bool) -> Exit
 def report(message: str, program: str = "rfm-client") -> None:
     """Write the message as one line to standard error."""
     print(f"{program}: {' '.join(message.split())}", file=sys.stderr, flush=True)
-
-
-def fail(message: str, program: str = "rfm-client") -> NoReturn:
-    """Report the message, and exit with 1."""
-    report(message, program)
-    raise typer.Exit(ExitCode.FAILED)
 
 
 @contextmanager
@@ -304,13 +293,46 @@ def _shown(default: Any) -> str:
     return f"{default:g}" if isinstance(default, float) else str(default)
 
 
-def add_missing(app: typer.Typer, name: str, reason: str, package: str, program: str = "rfm-client") -> None:
-    """Add a stand-in command that says how to install the application that has it."""
+def user_message(error: Exception) -> str:
+    """Return the message for a command-line user, who knows options but not Python function arguments."""
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return str(with_remedy(error, "leave --no-subsample out, or score prefixes (--sampling)"))
 
-    @app.command(
-        name,
-        help=f"Needs rfm-{package}, which is not installed.",
-        context_settings={"ignore_unknown_options": True, "allow_extra_args": True},
-    )
-    def missing() -> None:
-        fail(f"{name}: {reason}: pip install ./client ./apps/{package}", program)
+
+def with_remedy(error: Exception, remedy: str) -> Exception:
+    """Return a too-many-frames error with this remedy, or none if empty; return other errors as they are."""
+    if isinstance(error, errors.LocatedError) and error.remedy == FEWER_FRAMES:
+        return type(error).at(error.where, error.expected, error.got, remedy)
+    return error
+
+
+def in_plain_words(error: typer.BadParameter) -> str:
+    """Return the message for an invalid value, without the words of pydantic, which typer validates with."""
+    details: list[Any] = getattr(error.__cause__, "errors", list)()
+    expected = _EXPECTED.get(details[0]["type"]) if details else None
+    if expected is None:
+        return error.message.removeprefix("Value error, ")
+    return f"expected {expected}, got {details[0]['input']!r}"
+
+
+def write_options(command: Any, ctx: Any, formatter: Any) -> None:
+    """Write a section for each parameter group; required parameters come first in a section."""
+    sections: dict[str, list[tuple[str, str]]] = {title: [] for title in _FIRST}
+    for parameter in sorted(command.get_params(ctx), key=lambda each: not each.required):
+        record = parameter.get_help_record(ctx)
+        if record is not None:
+            is_argument = parameter.param_type_name == "argument"
+            record = (argument_name(parameter), record[1]) if is_argument else record
+            title = "Arguments" if is_argument else getattr(parameter, "rich_help_panel", None) or "Options"
+            sections.setdefault(title, []).append(record)
+    last = [title for title in _LAST if title in sections]
+    for title in [*(title for title in sections if title not in last), *last]:
+        if sections[title]:
+            with formatter.section(title):
+                formatter.write_dl(sections[title])
+
+
+def argument_name(parameter: Any) -> str:
+    """Return an argument's name as shown in the usage line and the help."""
+    return str(parameter.metavar or parameter.name.upper())

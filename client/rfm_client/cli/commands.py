@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import importlib.metadata
 import logging
-import shlex
 import time
+from contextlib import nullcontext
 from importlib.metadata import entry_points
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -16,42 +15,36 @@ import typer
 from rfm_client.cli import comparing, documents, scoring
 from rfm_client.cli.command import (
     EXIT_CODES,
+    MOST_COLUMNS,
     Command,
     Commands,
-    add_missing,
     exit_code_of,
     report,
     usage_errors,
     with_options,
+    with_remedy,
 )
-from rfm_client.cli.messages import MOST_COLUMNS, with_remedy
 from rfm_client.cli.options import (
     JsonOutput,
     OutputOptions,
-    PlotOutput,
     PrefixOptions,
     ScoredVideos,
     ServerOptions,
     StatusOptions,
+    SyntheticSamples,
     VideoOptions,
     WaitOptions,
-    check_folder,
 )
 from rfm_client.cli.show import (
-    StreamedTable,
+    Table,
     in_place_of_progress,
     scores_table,
     status_tables,
-    steps_with_server,
 )
-from rfm_client.cli.synthetic import BenchSamples, SyntheticSamples, are_frames, write_perf_analyzer_input
-from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import DeadlineExceededError, RewardError
 from rfm_client.contract.results import FRAME_SCORES
-from rfm_client.contract.wire import frames_name
 from rfm_client.plot import save
-
-MIN_COMPARED = 2
+from rfm_client.recording import Recording
 
 app = typer.Typer(
     name="rfm-client",
@@ -64,9 +57,9 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": MOST_COLUMNS},
 )
 
-_APPLICATIONS = {"evaluate": "labels", "gateway": "gateway", "label": "labels"}  # the package for each command
+MIN_COMPARED = 2
 
-VIDEOS = "Videos, .npy or .npz files, or URLs of videos."
+VIDEOS = "Videos, or .npy or .npz files."
 
 
 def _print_version(is_wanted: bool) -> None:
@@ -98,9 +91,11 @@ def score(
 
     Example: rfm-client score video.mp4 --task "put the block in the bowl"
     """
-    output.begin(videos)
+    output.begin(len(videos))
     video.begin(videos)
-    rows = StreamedTable(scoring.COLUMNS, videos)
+    columns, widths = zip(*scoring.COLUMNS, strict=True)
+    rows = Table(columns, [videos, *(["-" * width] for width in widths[1:])])
+    shown: list[scoring.Scored] = []
 
     def tell(outcome: scoring.Outcome) -> None:
         if isinstance(outcome, scoring.Failed):
@@ -111,21 +106,22 @@ def score(
         for note in filter(None, (FRAME_SCORES[name].mark_note(each) for name, each in result.arrays.items())):
             report(f"note: {outcome.name}: {note}")
         if output.prints_tables:
-            rows.write(outcome.row)
+            print(*rows.head * (not shown), rows.row(outcome.row), sep="\n", flush=True)
+        shown.append(outcome)
 
-    with scoring.recorder(output.rrd, videos) as record, server.connected() as client:
+    with nullcontext() if output.rrd is None else Recording(output.rrd) as recording, server.connected() as client:
         video.check_read(client)
-        outcomes = scoring.SourceScorer(client, video, prefix, record).score_all(videos, tell)
-    scored = [outcome for outcome in outcomes if isinstance(outcome, scoring.Scored)]
-    rows.end(" ".join(filter(None, (prefix.rule, in_place_of_progress(each.result for each in scored)))))
+        outcomes = scoring.SourceScorer(client, video, prefix, recording).score_all(videos, tell)
+    if output.prints_tables and shown:
+        print("\n  " + " ".join(filter(None, (prefix.rule, in_place_of_progress(each.result for each in shown)))))
     output.write_json(documents.score_document(server, video, prefix, outcomes))
-    if output.plot is not None and scored:
-        save(scoring.figure(scored, video.task), output.plot)
-    if output.strips is not None and scored:
+    if output.plot is not None and shown:
+        save(scoring.figure(shown, video.task), output.plot)
+    if output.strips is not None and shown:
         from rfm_client.cli.pictures import plot
 
-        title = scoring.heading(video.task, [outcome.checkpoint for outcome in scored])
-        plot(output.strips, [outcome.panel for outcome in scored], title)
+        title = scoring.heading(video.task, [outcome.checkpoint for outcome in shown])
+        plot(output.strips, [outcome.panel for outcome in shown], title)
     raise typer.Exit(scoring.exit_code_of_outcomes(outcomes))
 
 
@@ -134,7 +130,7 @@ def score(
 def compare(
     videos: Annotated[list[str], typer.Argument(metavar="VIDEO VIDEO...", help=VIDEOS)],
     video: VideoOptions,
-    output: PlotOutput,
+    output: JsonOutput,
     server: ServerOptions,
 ) -> None:
     """Rank several videos by how well they do the task.
@@ -146,19 +142,14 @@ def compare(
     """
     if len(videos) < MIN_COMPARED:
         raise typer.BadParameter(f"expected at least {MIN_COMPARED} videos, got {len(videos)}", param_hint="VIDEO")
-    output.begin(videos)
+    output.begin()
     with server.connected() as client:
         comparison = comparing.compare(client, videos, video)
-        checkpoint = scoring.checkpoint_of(client, comparison.sources[0].trajectory)
     for source, scores in zip(comparison.sources, comparison.scores, strict=True):
         _report_subsampled(source.name, len(scores.progress), source.trajectory.num_frames)
     if output.prints_tables:
         typer.echo("\n".join(comparison.tables()))
     output.write_json(documents.comparison_document(server, video, comparison))
-    if output.plot is not None:
-        from rfm_client.cli.pictures import plot
-
-        plot(output.plot, comparison.panels(), scoring.heading(video.task, [checkpoint]))
 
 
 @app.command(cls=Command, epilog=EXIT_CODES)
@@ -182,7 +173,7 @@ def status(
 
     if metrics_url is not None and len(server.urls) > 1:
         raise typer.BadParameter("--metrics-url needs a single --url")
-    output.check_folders()
+    output.begin()
     with usage_errors("--url"):
         statuses = [
             ServerStatus.read(url, metrics_url=metrics_url, timeout_s=server.timeout_s, credentials=server.credentials)
@@ -190,8 +181,6 @@ def status(
         ]
     if output.prints_tables:
         typer.echo("\n".join(map(status_tables, statuses)))
-        if ready := next((status for status in statuses if status.ready), None):
-            typer.echo(steps_with_server(ready.url, ready.checkpoints))
     output.write_json(documents.status_document(statuses))
 
 
@@ -222,7 +211,7 @@ def sample(
 
     Example: rfm-client sample --num-samples 8
     """
-    output.check_folders()
+    output.begin()
     with server.connected() as client:
         samples = synthetic.samples(client)
         outcomes = client.evaluate(samples, return_errors=True)
@@ -232,34 +221,10 @@ def sample(
             report(f"samples[{index}]: {with_remedy(outcome, '')}")  # not the videos' remedy: --num-frames decides
     rows = [(f"{index}", outcome) for index, outcome in enumerate(outcomes) if not isinstance(outcome, RewardError)]
     if output.prints_tables and rows:
-        of = "frames" if are_frames(samples) else "embeddings"
+        of = "embeddings" if samples[0].trajectories[0].frames is None else "frames"
         typer.echo(scores_table(f"{synthetic.sample_type} of random {of}", rows))
     output.write_json(documents.samples_document(server, synthetic.sample_type, outcomes))
     raise typer.Exit(exit_code_of(failures, some_succeeded=len(failures) < len(outcomes)))
-
-
-@app.command(cls=Command, epilog=EXIT_CODES)
-@with_options
-def bench_input(
-    output: Annotated[Path, typer.Option(help="JSON file to write.")],
-    synthetic: BenchSamples,
-    server: ServerOptions,
-) -> None:
-    """Write synthetic samples as input of Triton's perf_analyzer.
-
-    It prints a perf_analyzer command that sends them.
-
-    Example: rfm-client bench-input --output samples.json
-    """
-    with usage_errors("--output"):
-        check_folder("output", output.parent)
-    with server.connected() as client:
-        samples = synthetic.samples(client)
-    write_perf_analyzer_input(output, samples)
-    protocol, address = split_url(server.urls[0])
-    name = frames_name(server.model) if are_frames(samples) else server.model
-    words = ["perf_analyzer", "-m", name, "-i", protocol.removesuffix("s"), "-u", address, "--input-data", str(output)]
-    typer.echo(shlex.join([*words, "--async", "--concurrency-range", "1:16:5"]))
 
 
 def _report_subsampled(name: str, num_scored: int, num_frames: int) -> None:
@@ -268,16 +233,12 @@ def _report_subsampled(name: str, num_scored: int, num_frames: int) -> None:
 
 
 def _add_applications() -> None:
-    """Add the commands of installed applications; for the others, stand-ins that say how to install them."""
-    reasons = {name: f"rfm-{_APPLICATIONS[name]} is not installed" for name in _APPLICATIONS}
+    """Add the commands of installed applications."""
     for found in sorted(entry_points(group="rfm_client.commands"), key=lambda each: each.name):
         try:
             app.command(found.name, cls=Command, epilog=EXIT_CODES)(found.load())
-            reasons.pop(found.name, None)
         except ImportError as error:
-            reasons[found.name] = str(error)
-    for name, reason in reasons.items():
-        add_missing(app, name, reason, _APPLICATIONS.get(name, name))
+            Commands.missing[found.name] = f"{error}: {Commands.missing.get(found.name, found.value)}"
 
 
 _add_applications()

@@ -11,12 +11,10 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import PurePath
 from statistics import fmean
 from typing import cast
 
 from rfm_client.cli.options import VideoOptions
-from rfm_client.cli.pictures import Panel
 from rfm_client.cli.scoring import Source
 from rfm_client.cli.show import at_end, number, table
 from rfm_client.client import RewardClient
@@ -83,16 +81,6 @@ class Comparison:
             table("", columns, [self._row(index) for index in self._shown]),
             table("", pairs, [self._pair_row(*couple) for couple in self.couples()], names=2),
             *([LEGEND] if self.ranking is None else []),
-        ]
-
-    def panels(self) -> list[Panel]:
-        """Return a plot panel for each source, in table order."""
-        return [
-            self.sources[index].panel(
-                f"{self._rank(index)}. {PurePath(self.sources[index].name).name}: wins with P = {self.wins[index]:.3f}",
-                self.scores[index],
-            )
-            for index in self._shown
         ]
 
     @property

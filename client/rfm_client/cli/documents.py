@@ -18,14 +18,13 @@ from rfm_client.contract.results import (
     FRAME_SCORES,
     FrameScores,
     PreferenceResult,
-    ProgressResult,
     Result,
     answer,
     trajectory_scores,
 )
 from rfm_client.transport.status import ServerStatus
 
-SIDES = ("first", "second")  # in a comparison
+SIDES = ("first", "second")  # the JSON names of the two videos, if two are compared
 
 
 def score_document(
@@ -82,16 +81,10 @@ def samples_document(server: ServerOptions, kind: str, outcomes: Sequence[Result
     return {**server.origin, "sample_type": kind, "samples": samples}
 
 
-def result_document(result: Result, times_s: Sequence[Times | None] = (None, None)) -> dict[str, Any]:
-    """Return the document for a result.
-
-    times_s: float64 [T] for each trajectory, times of its T scored frames; None: unknown
-    """
-    version = {"model_version": result.model_version}
-    if isinstance(result, ProgressResult):
-        return {**version, **frame_document(result, times_s[0])}
-    of_both = zip(trajectory_scores(result).items(), times_s, strict=True)
-    return {**version, **answer(result), **{name: frame_document(scores, times) for (name, scores), times in of_both}}
+def result_document(result: Result) -> dict[str, Any]:
+    """Return the document for a result."""
+    shown = {name: frame_document(scores, None) for name, scores in trajectory_scores(result).items()}
+    return {"model_version": result.model_version, **answer(result), **shown.pop("", {}), **shown}
 
 
 def frame_document(scores: FrameScores, times_s: Times | None) -> dict[str, Any]:
@@ -129,7 +122,8 @@ def _outcome(outcome: Outcome) -> dict[str, Any]:
     if not isinstance(outcome, Scored):
         return {"source": outcome.name, **_error(outcome.error, outcome.message)}
     about = {"source": outcome.name, "num_frames": outcome.num_frames, "took_s": outcome.took_s}
-    return {**about, **result_document(outcome.result, (outcome.times_s,))}
+    scores = frame_document(outcome.result, outcome.times_s)
+    return {**about, "model_version": outcome.result.model_version, **scores}
 
 
 def _verdict(pair: PreferenceResult) -> dict[str, Any]:

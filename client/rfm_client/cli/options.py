@@ -7,20 +7,21 @@ import json
 import os
 import shlex
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, TypeAlias
 
+import numpy as np
 import typer
 
 from rfm_client.async_client import DEFAULT_TIMEOUT_S
 from rfm_client.cli.command import STANDARD_OUTPUT, usage_errors
 from rfm_client.client import RewardClient
-from rfm_client.contract import errors
 from rfm_client.contract.checks import require
-from rfm_client.contract.errors import InvalidSampleError, InvalidValueError
+from rfm_client.contract.errors import InvalidSampleError, InvalidValueError, ModelNotFoundError, RewardError
+from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, random_trajectory
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
 from rfm_client.contract.wire import DEFAULT_MODEL
 from rfm_client.frames.orientation import ChannelOrder, Orientation
@@ -28,20 +29,14 @@ from rfm_client.frames.sampling import RULES, Rule, Sampling
 from rfm_client.plot import MAX_CURVES
 from rfm_client.transport.connection import Credentials
 
+SampleType: TypeAlias = Literal["progress", "preference", "similarity"]
+
+SYNTHETIC_TASK = "put the block in the bowl"
 DEFAULT_URL = "grpc://localhost:8001"
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.001, 86_400
 FRAMES = "Frames"  # heading for all options that decide which frames are scored, and from what
-MAX_PICTURED = MAX_CURVES  # videos; a larger picture is unreadable, and soon cannot be drawn
 _PICTURES = (".png", ".pdf", ".svg")
 _ENDINGS = {"json": (".json",), "plot": _PICTURES, "strips": _PICTURES, "rrd": (".rrd",)}
-
-
-def check_folder(name: str, folder: Path) -> None:
-    """Raise ConfigError about the setting ``name`` if no file can be created in the folder."""
-    if not folder.is_dir():
-        raise ConfigError.at(name, f"a folder at {folder}", f"none: mkdir -p {shlex.quote(str(folder))}")
-    if not os.access(folder, os.W_OK):
-        raise ConfigError.at(name, f"a folder at {folder} that you can write to", "no permission")
 
 
 def timeout_setting(default_s: float, help: str = "Time limit of a request, in seconds.") -> Any:
@@ -100,35 +95,36 @@ class ServerOptions(CredentialFiles):
         """The servers and the model, for JSON documents."""
         return {"servers": list(self.urls), "model": self.model}
 
-    def client(self, **options: Any) -> RewardClient:
-        """Return a client. Raises typer.BadParameter for an invalid URL."""
+    def client(self, *urls: str, **options: Any) -> RewardClient:
+        """Return a client for these servers, else for all. Raises typer.BadParameter for an invalid URL."""
         with usage_errors("--url"):
-            return RewardClient(
-                self.urls, model=self.model, **{"timeout_s": self.timeout_s, **self.credentials.options, **options}
-            )
+            given = {"timeout_s": self.timeout_s, **self.credentials.options, **options}
+            return RewardClient(urls or self.urls, model=self.model, **given)
 
     @contextmanager
     def connected(self) -> Iterator[RewardClient]:
         """Yield a client if a server answers and serves the model. Otherwise raise RewardError at once."""
         with self.client() as client:
-            self._check()
+            problems: list[RewardError] = []
+            for url in self.urls:
+                if (problem := self._problem(url)) is None:
+                    break
+                problems.append(problem)
+            else:
+                raise problems[0]
             yield client
 
-    def _check(self) -> None:
-        problems = []
-        for url in self.urls:
-            with RewardClient(
-                url, model=self.model, timeout_s=self.timeout_s, retry=False, **self.credentials.options
-            ) as one:
+    def _problem(self, url: str) -> RewardError | None:
+        """Return why a server does not score; None: it does."""
+        with self.client(url, retry=False) as client:
+            try:
                 try:
-                    try:
-                        one.model_info()
-                    except errors.ModelNotFoundError:
-                        one.model_info(frames=True)
-                    return
-                except errors.RewardError as error:
-                    problems.append(error)
-        raise problems[0]
+                    client.model_info()
+                except ModelNotFoundError:
+                    client.model_info(frames=True)
+            except RewardError as error:
+                return error
+        return None
 
 
 @dataclass(frozen=True)
@@ -148,18 +144,6 @@ class WaitOptions(ServerOptions):
 
 
 @dataclass(frozen=True)
-class VideoFiles(Settings):
-    """The videos' task, and frame size, orientation and colours."""
-
-    TITLE: ClassVar[str] = "Videos"
-
-    task: str = setting("", "The task, as a sentence. Required, except for embeddings with a task.")
-    resize: bool = setting(False, "Downscale frames to the model's input size before sending.")
-    orient: Orientation = setting("none", "Turn frames upright first (see docs/guides/label_a_dataset.md).")
-    channels: ChannelOrder = setting("rgb", "Channel order in the file; bgr swaps red and blue.")
-
-
-@dataclass(frozen=True)
 class FrameRate(Settings):
     """Which frames to sample from a video."""
 
@@ -169,9 +153,15 @@ class FrameRate(Settings):
 
 
 @dataclass(frozen=True)
-class VideoOptions(FrameRate, VideoFiles):
-    """The videos' task, and which frames to send at what size."""
+class VideoOptions(FrameRate):
+    """The videos' task, and which frames to send at what size and orientation."""
 
+    TITLE: ClassVar[str] = "Videos"
+
+    task: str = setting("", "The task, as a sentence. Required, except for embeddings with a task.")
+    resize: bool = setting(False, "Downscale frames to the model's input size before sending.")
+    orient: Orientation = setting("none", "Turn frames upright first (see docs/guides/label_a_dataset.md).")
+    channels: ChannelOrder = setting("rgb", "Channel order in the file; bgr swaps red and blue.")
     subsample: bool = setting(True, "Reduce each video to the number of frames of training, evenly spaced.")
 
     @property
@@ -248,9 +238,7 @@ class JsonOutput(Settings):
 
     TITLE: ClassVar[str] = "Outputs"
 
-    json: str | None = setting(
-        None, "Write JSON to FILE; without FILE print it instead of the table.", metavar="[FILE|-]"
-    )
+    json: str | None = setting(None, "Write JSON to FILE; - prints it instead of the table.", metavar="FILE|-")
 
     def __post_init__(self) -> None:
         for name, value in self._files.items():
@@ -268,10 +256,16 @@ class JsonOutput(Settings):
         """Return the files to write, by option."""
         return {name: value for name in _ENDINGS if (value := getattr(self, name, None)) is not None}
 
-    def check_folders(self) -> None:
-        """Raise ConfigError, before the first request, for a file in a missing or closed folder."""
+    def begin(self, num_videos: int = 0) -> None:
+        """Raise ConfigError, before the first request, for a file that cannot be created or show so many videos."""
         for name, file in self._files.items():
-            check_folder(name, Path(file).parent)
+            if _ENDINGS[name] == _PICTURES and num_videos > MAX_CURVES:
+                raise ConfigError.at(name, f"at most {MAX_CURVES} videos", num_videos)
+            folder = Path(file).parent
+            if not folder.is_dir():
+                raise ConfigError.at(name, f"a folder at {folder}", f"none: mkdir -p {shlex.quote(str(folder))}")
+            if not os.access(folder, os.W_OK):
+                raise ConfigError.at(name, f"a folder at {folder} that you can write to", "no permission")
 
     def write_json(self, document: Mapping[str, Any]) -> None:
         """Write the document to the file or standard output, if --json is given."""
@@ -285,23 +279,7 @@ class JsonOutput(Settings):
 
 
 @dataclass(frozen=True)
-class PlotOutput(JsonOutput):
-    """Files that show a comparison."""
-
-    plot: Path | None = setting(
-        None, "Draw frames of each video above its scores, the best first: .png, .pdf or .svg.", metavar="FILE"
-    )
-
-    def begin(self, videos: Sequence[str]) -> None:
-        """Raise ConfigError for a missing folder, and for more videos than the files can show."""
-        for name in self._files:
-            if _ENDINGS[name] == _PICTURES and len(videos) > MAX_PICTURED:
-                raise ConfigError.at(name, f"at most {MAX_PICTURED} videos", len(videos))
-        self.check_folders()
-
-
-@dataclass(frozen=True)
-class OutputOptions(PlotOutput):
+class OutputOptions(JsonOutput):
     """Files that show the videos' scores."""
 
     plot: Path | None = setting(
@@ -313,3 +291,32 @@ class OutputOptions(PlotOutput):
     rrd: Path | None = setting(
         None, "Record frames and scores on one timeline for Rerun's viewer: .rrd.", metavar="FILE"
     )
+
+
+@dataclass(frozen=True)
+class SyntheticSamples(Settings):
+    """Synthetic samples: type, number, and trajectory length."""
+
+    TITLE: ClassVar[str] = "Samples"
+
+    sample_type: SampleType = setting("progress", "Type of the samples.")
+    num_samples: int = setting(4, "Number of samples.", least=1, most=10_000)
+    num_frames: int = setting(8, "Frames of a trajectory.", least=1, most=9999)
+    use_frames: bool = setting(False, "Send random frames even if the model takes embeddings.")
+
+    def samples(self, client: RewardClient) -> list[Sample]:
+        """Return samples with the served checkpoint's widths. Raises ModelNotFoundError if no model takes them."""
+        info = None
+        if not self.use_frames:
+            with suppress(ModelNotFoundError):
+                info = client.model_info()
+        widths = (info or client.model_info(frames=True)).widths
+        random = np.random.default_rng(0)
+        kinds = {"progress": ProgressSample, "preference": PreferenceSample, "similarity": SimilaritySample}
+        count = 1 if self.sample_type == "progress" else 2
+        return [
+            kinds[self.sample_type](
+                *(random_trajectory(random, self.num_frames, widths, task=SYNTHETIC_TASK) for _ in range(count))
+            )
+            for _ in range(self.num_samples)
+        ]

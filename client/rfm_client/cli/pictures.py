@@ -14,25 +14,23 @@ import numpy.typing as npt
 
 from rfm_client.contract.results import FRAME_SCORES, SUCCESS_THRESHOLD, FrameScores
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.plot import BOUNDS, COLOURS, FAINT, GRID, STYLE, THRESHOLD, save
+from rfm_client.plot import BOUNDS, COLOURS, GRID, THRESHOLD, drawing, save
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 ALL_FRAMES = 10  # shown in a strip, if the trajectory has no more
-MOST_FRAMES, FEWEST_FRAMES = 8, 5  # shown in a longer trajectory's strip
-EVEN_ENOUGH = 1.4  # largest gap between strip frames, as a multiple of the smallest
+FEW_FRAMES = 6  # shown in a longer trajectory's strip
+_LEAST_GAP = 0.7  # between a strip's frames, as a share of the mean: frames that do not overlap then stay readable
 WIDTH_IN = 7.0  # page width
 COLUMN_WIDTH_IN = 4.8  # width of panels side by side
 
 # inches within a panel
-_LEFT, _RIGHT = 0.5, 0.1
-_SECOND_AXIS = 0.35  # extra space at the right, for success beside a score with a unit
+_LEFT, _RIGHT = 0.5, 0.4
 _TITLE, _STRIP_GAP, _BELOW = 0.22, 0.06, 0.5
 _CURVES = 1.3
 _HIGHEST_FRAME = 1.2
-_FRAME_GAP = 0.04
+_FRAME_SHARE = 0.97  # of the room between frames; the rest is a gap
 _HEADLINE = 0.17  # a line in the figure's title
 _LETTER = 0.08
 
@@ -74,137 +72,86 @@ class Panel:
         """
         scored = scores.scored_frames
         positions = scored.astype(np.float64) if times_s is None else times_s[scored]
-        shown = _evenly(positions)
-        strip = None if frames is None else frames[scored[shown]]
-        return cls(title, scores, positions, "frame" if times_s is None else "s", strip, positions[shown])
-
-
-def _evenly(positions: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
-    """Return frame indices for a strip: as many as lie evenly spaced, including the first and the last."""
-    best, least = np.arange(len(positions)), np.inf
-    counts = range(MOST_FRAMES, FEWEST_FRAMES - 1, -1)
-    for count in (*[len(positions)] * (len(positions) <= ALL_FRAMES), *counts):
+        count = len(positions) if len(positions) <= ALL_FRAMES else FEW_FRAMES
         targets = np.linspace(positions[0], positions[-1], count)
         shown = np.unique(np.abs(positions - targets[:, None]).argmin(axis=1))
-        gaps = np.diff(positions[shown])
-        ratio = gaps.max() / gaps.min() if len(gaps) else 1.0
-        if ratio < least:
-            best, least = shown, ratio
-        if ratio <= EVEN_ENOUGH:
-            break
-    return best
+        gaps = np.diff(positions[shown], append=np.inf)  # after a long gap, the nearest frames may lie together
+        shown = shown[gaps > _LEAST_GAP * np.ptp(positions) / count]
+        strip = None if frames is None else frames[scored[shown]]
+        return cls(title, scores, positions, "frame" if times_s is None else "s", strip, positions[shown])
 
 
 def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, columns: int = 1) -> None:
     """Draw a picture, in the format given by the file suffix: for each panel the scores, and above them some frames.
 
-    title: the first line is bold
     columns: panels side by side
     """
-    try:
-        import matplotlib.style
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError('plots need matplotlib: pip install "./client[cli]"') from error
-
+    panel_in = WIDTH_IN if columns == 1 else COLUMN_WIDTH_IN
+    width_in, curves_in = panel_in * columns, panel_in - _LEFT - _RIGHT
     rows = [panels[start : start + columns] for start in range(0, len(panels), columns)]
-    width_in = WIDTH_IN if columns == 1 else COLUMN_WIDTH_IN
-    layouts = [[_Layout.of(panel, width_in) for panel in row] for row in rows]
-    heights_in = [max(layout.height_in for layout in row) for row in layouts]
-    lines = [] if title is None else _wrapped(title, width_in * columns - _LEFT)
+    strips_in = [max(_frame_in(panel, curves_in)[1] for panel in row) for row in rows]
+    most = int((width_in - _LEFT) / _LETTER)
+    lines = [part for line in (title or "").splitlines() for part in textwrap.wrap(line, most)]
     top_in = 0.1 + (_HEADLINE * len(lines) + 0.04 if lines else 0)
-    with matplotlib.style.context([*STYLE]):
-        figure = Figure(figsize=(width_in * columns, top_in + sum(heights_in)))
-        for number, (line, is_first) in enumerate(lines):
-            look: dict[str, Any] = {"weight": "bold"} if is_first else {"color": FAINT}
-            y = 1 - (0.1 + _HEADLINE * number) / figure.get_figheight()
-            figure.text(_LEFT / figure.get_figwidth(), y, line, va="top", **look)
-        for row, own, height_in in zip(rows, layouts, heights_in, strict=True):
-            for column, (panel, layout) in enumerate(zip(row, own, strict=True)):
-                _draw(_Page(figure, width_in * column + _LEFT, top_in), panel, layout, height_in)
-            top_in += height_in
+    height_in = top_in + sum(_TITLE + strip_in + _STRIP_GAP + _CURVES + _BELOW for strip_in in strips_in)
+    with drawing() as new_figure:
+        figure = new_figure(figsize=(width_in, height_in))
+
+        def axes(left_in: float, top_in: float, height: float, **more: Any) -> Axes:
+            bottom_in = height_in - top_in - height
+            box = (left_in / width_in, bottom_in / height_in, curves_in / width_in, height / height_in)
+            return figure.add_axes(box, **more)
+
+        figure.text(_LEFT / width_in, 1 - 0.1 / height_in, "\n".join(lines), va="top", linespacing=1.5)
+        for row, strip_in in zip(rows, strips_in, strict=True):
+            below_in = top_in + _TITLE + strip_in + _STRIP_GAP
+            for column, panel in enumerate(row):
+                left_in = panel_in * column + _LEFT
+                curves = axes(left_in, below_in, _CURVES)
+                _draw_curves(curves, panel)
+                if panel.strip is None:
+                    curves.set_title(panel.title)
+                else:
+                    strip = axes(left_in, below_in - _STRIP_GAP - strip_in, strip_in, sharex=curves)
+                    _draw_strip(strip, panel, _frame_in(panel, curves_in), curves_in)
+                    curves.grid(visible=False, axis="x")
+                    for position in panel.strip_positions:
+                        curves.axvline(position, **GRID)
+            top_in = below_in + _CURVES + _BELOW
         save(figure, file)
 
 
-def _wrapped(title: str, width_in: float) -> list[tuple[str, bool]]:
-    """Return the title's lines, fitted to the width, and True for those from its first line."""
-    most = int(width_in / _LETTER)
-    return [(part, not number) for number, line in enumerate(title.splitlines()) for part in textwrap.wrap(line, most)]
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """Panel dimensions in inches. limits: time axis limits, so that no frame is cut off."""
-
-    width_in: float
-    strip_in: float
-    frame_in: float
-    limits: tuple[float, float]
-
-    @property
-    def height_in(self) -> float:
-        return _TITLE + self.strip_in + (_STRIP_GAP if self.strip_in else 0) + _CURVES + _BELOW
-
-    @classmethod
-    def of(cls, panel: Panel, panel_in: float) -> _Layout:
-        """Return the layout with the widest frames that do not overlap at their times."""
-        width_in = panel_in - _LEFT - _RIGHT - (_SECOND_AXIS if panel.has_second_axis else 0)
-        first, last = panel.positions[[0, -1]].tolist()
-        if panel.strip is None:
-            margin = 0.02 * (last - first) or 0.5
-            return cls(width_in, 0, 0, (first - margin, last + margin))
-        height_px, width_px = panel.strip.shape[1:3]
-        most_in = _HIGHEST_FRAME * width_px / height_px
-        if first == last:
-            frame_in = min(most_in, width_in)
-            return cls(width_in, frame_in * height_px / width_px, frame_in, (first - 0.5, last + 0.5))
+def _frame_in(panel: Panel, curves_in: float) -> tuple[float, float]:
+    """Return the width and height in inches of the largest frames that do not overlap at their times."""
+    if panel.strip is None:
+        return 0.0, 0.0
+    height_px, width_px = panel.strip.shape[1:3]
+    room_in = curves_in
+    if len(panel.strip) > 1:
         nearest = np.diff(panel.strip_positions).min()
-        frame_in = min(most_in, width_in * nearest / (last - first + nearest))
-        margin = (last - first) * frame_in / (width_in - frame_in) / 2
-        return cls(width_in, frame_in * height_px / width_px, frame_in, (first - margin, last + margin))
+        room_in *= nearest / (np.ptp(panel.strip_positions) + nearest)
+    width_in = min(_HIGHEST_FRAME * width_px / height_px, room_in)
+    return width_in, width_in * height_px / width_px
 
 
-@dataclass(frozen=True)
-class _Page:
-    """A figure measured in inches from a point near the top left corner."""
-
-    figure: Figure
-    left_in: float
-    top_in: float
-
-    def axes(self, left_in: float, top_in: float, width_in: float, height_in: float) -> Axes:
-        """Add axes that begin this far right of the point and below it."""
-        width, height = self.figure.get_size_inches()
-        bottom = 1 - (self.top_in + top_in + height_in) / height
-        return self.figure.add_axes(((self.left_in + left_in) / width, bottom, width_in / width, height_in / height))
-
-
-def _draw(page: _Page, panel: Panel, layout: _Layout, height_in: float) -> None:
-    begin, end = layout.limits
-    below_in = height_in - _CURVES - _BELOW  # all panels in a row draw their curves at the same height
-    axes = page.axes(0, below_in, layout.width_in, _CURVES)
-    axes.set_xlim(layout.limits)
-    axes.set_xlabel("time (s)" if panel.unit == "s" else "frame", loc="left")
-    if len(panel.positions) == 1:
-        axes.set_xticks(panel.positions)
-    top_in = below_in
-    if panel.strip is not None:
-        top_in -= layout.strip_in + _STRIP_GAP
-        for frame, position in zip(panel.strip, panel.strip_positions, strict=True):
-            middle_in = (position - begin) / (end - begin) * layout.width_in
-            width_in = layout.frame_in - _FRAME_GAP
-            picture = page.axes(middle_in - width_in / 2, top_in, width_in, layout.strip_in)
-            picture.imshow(frame, aspect="auto")
-            picture.set_axis_off()
-            axes.axvline(position, **GRID)
-        axes.grid(visible=False, axis="x")
-    _draw_curves(axes, panel)
-    words = page.axes(0, top_in - _TITLE, layout.width_in, _TITLE)
-    words.set_axis_off()
-    words.text(0, 0.65, panel.title, va="center")
+def _draw_strip(axes: Axes, panel: Panel, frame_in: tuple[float, float], curves_in: float) -> None:
+    """Draw the frames at their times, and widen the time axis so that none is cut off."""
+    assert panel.strip is not None
+    (width_in, height_in), (first, last) = frame_in, panel.strip_positions[[0, -1]]
+    margin = (last - first) * width_in / (curves_in - width_in) / 2 if last > first else 0.5
+    width = width_in / curves_in * (last - first + 2 * margin) * _FRAME_SHARE
+    for frame, position in zip(panel.strip, panel.strip_positions, strict=True):
+        axes.imshow(frame, extent=(position - width / 2, position + width / 2, 0, height_in), aspect="auto")
+    strip_in = axes.bbox.height / axes.figure.dpi  # as high as the highest in the row
+    axes.set(xlim=(first - margin, last + margin), ylim=(0, strip_in))
+    axes.set_title(panel.title, y=height_in / strip_in)
+    axes.set_axis_off()
 
 
 def _draw_curves(axes: Axes, panel: Panel) -> None:
+    axes.set_xlabel("time (s)" if panel.unit == "s" else "frame", loc="left")
+    if len(panel.positions) == 1:
+        axes.set_xticks(panel.positions)
     leading = FRAME_SCORES[panel.scores.leading]
     of_shares = axes.twinx() if panel.has_second_axis else axes
     handles = []

@@ -4,19 +4,16 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path, PurePath
+from pathlib import PurePath
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.cli.command import ExitCode, exit_code, exit_code_of, missing_package
-from rfm_client.cli.messages import user_message
+from rfm_client.cli.command import ExitCode, exit_code, exit_code_of, missing_package, user_message
 from rfm_client.cli.options import PrefixOptions, VideoOptions
 from rfm_client.cli.pictures import Panel
 from rfm_client.cli.show import at_end, number
@@ -34,6 +31,7 @@ from rfm_client.contract.results import FrameScores, ProgressResult
 from rfm_client.contract.samples import Trajectory
 from rfm_client.frames.sampling import Sampling
 from rfm_client.plot import plot_scores
+from rfm_client.recording import Recording
 from rfm_client.scoring.samples import CallOptions
 
 if TYPE_CHECKING:
@@ -60,11 +58,11 @@ class Source:
 
     @classmethod
     def read(cls, name: str, video: VideoOptions) -> Source:
-        """Read the source from a file or URL. Raises InvalidSampleError."""
+        """Read the source from a file. Raises InvalidSampleError."""
         from rfm_client.frames.inputs import ARRAY_SUFFIXES, load_trajectory
-        from rfm_client.frames.video import frame_times_s, is_url
+        from rfm_client.frames.video import frame_times_s
 
-        are_arrays = not is_url(name) and PurePath(name).suffix.lower() in ARRAY_SUFFIXES
+        are_arrays = PurePath(name).suffix.lower() in ARRAY_SUFFIXES
         fps = None if are_arrays else video.fps
         trajectory = load_trajectory(
             name, task=video.task, fps=fps, orient=video.orient, channels=video.channels, **video.more
@@ -72,17 +70,11 @@ class Source:
         if trajectory.frames is not None and is_blank(trajectory.task):
             own = repr(trajectory.task) if trajectory.task.strip() else "none"
             raise InvalidSampleError.at("task", "a sentence with frames", f'{own}: add --task "SENTENCE"')
-        # A video from a URL is not kept, so its times cannot be read.
-        has_times = not are_arrays and not is_url(name)
-        return cls(name, trajectory, frame_times_s(name, trajectory.num_frames) if has_times else None)
+        return cls(name, trajectory, None if are_arrays else frame_times_s(name, trajectory.num_frames))
 
     def times_of(self, scores: FrameScores) -> Times | None:
         """Return the scored frames' times in the video, float64 [T]; None: unknown."""
         return None if self.times_s is None else self.times_s[scores.scored_frames]
-
-    def panel(self, title: str, scores: FrameScores) -> Panel:
-        """Return the source's panel for a plot."""
-        return Panel.of(title, scores, self.trajectory.frames, self.times_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,27 +116,26 @@ class Failed:
 
 Outcome: TypeAlias = Scored | Failed
 Tell = Callable[[Outcome], None]
-Record = Callable[[int, Source, FrameScores], None]  # may be called from any thread
 
 
 @dataclass
 class SourceScorer:
     """Scores sources, in several threads, until no server answers any more.
 
-    record: called with each source and its frames, before memory is freed; None: no record
+    recording: gets each source's frames and scores, before memory is freed; None: no recording
     """
 
     client: RewardClient
     video: VideoOptions
     prefix: PrefixOptions
-    record: Record | None = None
+    recording: Recording | None = None
     _gone: RewardError | None = None
 
     def score_all(self, names: Sequence[str], tell: Tell) -> list[Outcome]:
         """Return the outcomes for all sources, in order. ``tell`` gets an outcome once all before it have arrived."""
         with ThreadPoolExecutor(WORKERS) as pool:
             try:
-                futures = [pool.submit(self.outcome, number, name) for number, name in enumerate(names)]
+                futures = [pool.submit(self.outcome, *each) for each in zip(names, unique_stems(names), strict=True)]
                 for future in futures:
                     tell(future.result())
             except BaseException:  # an interrupt, or a full disk: start no other source
@@ -152,8 +143,8 @@ class SourceScorer:
                 raise
         return [future.result() for future in futures]
 
-    def outcome(self, number: int, name: str) -> Outcome:
-        """Return a source's scores, or why it failed."""
+    def outcome(self, name: str, stem: str) -> Outcome:
+        """Return a source's scores, or why it failed. stem: its name in the recording."""
         started_s = time.monotonic()
         if self._gone is not None:
             return Failed(name, self._gone, NOT_ASKED, is_server_gone=True)
@@ -169,15 +160,15 @@ class SourceScorer:
             if isinstance(error, InvalidSampleError) and error.source == name:  # the report already names it
                 error.source = ""
             return Failed(name, error, user_message(error), is_server_gone=self._is_server_gone(error))
-        if self.record is not None:
-            self.record(number, source, result)
+        if self.recording is not None:
+            self.recording.add(stem, result, source.trajectory.frames, source.times_s)
         return Scored(
             name=name,
             checkpoint=checkpoint,
             result=result,
             num_frames=source.trajectory.num_frames,
             times_s=source.times_of(result),
-            panel=source.panel(PurePath(name).name, result),
+            panel=Panel.of(PurePath(name).name, result, source.trajectory.frames, source.times_s),
             took_s=time.monotonic() - started_s,
         )
 
@@ -202,16 +193,10 @@ def exit_code_of_outcomes(outcomes: Sequence[Outcome]) -> ExitCode:
 
 
 def unique_stems(names: Sequence[str]) -> list[str]:
-    """Return a file name for each source: the name without folder and suffix, numbered if taken."""
-    stems: dict[str, None] = {}
-    repeated: Counter[str] = Counter()
-    for name in names:
-        stem = free = PurePath(name.partition("?")[0]).stem or "video"
-        while free in stems:
-            repeated[stem] += 1
-            free = f"{stem}_{repeated[stem] + 1}"
-        stems[free] = None
-    return list(stems)
+    """Return a short name for each source: the file's without suffix, all numbered if one repeats."""
+    stems = [PurePath(name.partition("?")[0]).stem or "video" for name in names]
+    is_unique = len(set(stems)) == len(stems)
+    return stems if is_unique else [f"{number}_{stem}" for number, stem in enumerate(stems, 1)]
 
 
 def _evaluate(
@@ -243,32 +228,9 @@ def heading(task: str, checkpoints: Iterable[str]) -> str:
 
 def figure(scored: Sequence[Scored], task: str) -> Figure:
     """Return one figure with these sources' curves. Raises ImportError without matplotlib."""
-    files = [PurePath(each.name).name for each in scored]
-    is_unique = len(set(files)) == len(files)
     return plot_scores(
         [each.result for each in scored],
-        files if is_unique else [each.name for each in scored],
+        unique_stems([each.name for each in scored]),
         title=heading(task, [each.checkpoint for each in scored]),
         times_s=[each.times_s for each in scored],
     )
-
-
-@contextmanager
-def recorder(file: Path | None, names: Sequence[str]) -> Iterator[Record | None]:
-    """Yield a function that records a source in a Rerun file, under its unique stem; None: no file.
-
-    Raises ImportError if the package is missing.
-    """
-    if file is None:
-        yield None
-        return
-    from rfm_client.recording import Recording
-
-    stems = unique_stems(names)
-    with Recording(file) as recording:
-
-        def record(number: int, source: Source, scores: FrameScores) -> None:
-            frames = source.trajectory.frames
-            recording.add((stems[number],), scores, {} if frames is None else {"": frames}, source.times_s)
-
-        yield record

@@ -118,30 +118,6 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
     print(table(title, columns, rows, names=names))
 
 
-class StreamedTable:
-    """A table on standard output, written row by row.
-
-    columns: headers, and column widths after the first
-    names: all cells in the first column
-    """
-
-    def __init__(self, columns: Sequence[tuple[str, int]], names: Sequence[str]) -> None:
-        headers, widths = zip(*columns, strict=True)
-        self._table = Table(headers, [names, *(["-" * width] for width in widths[1:])])
-        self._is_begun = False
-
-    def write(self, cells: Sequence[str]) -> None:
-        """Write a row at once; before the first row, the headers."""
-        for line in (*self._table.head * (not self._is_begun), self._table.row(cells)):
-            print(line, flush=True)
-        self._is_begun = True
-
-    def end(self, text: str) -> None:
-        """Write a line below the table, if it has a row."""
-        if self._is_begun:
-            print(f"\n{GAP}{text}", flush=True)
-
-
 def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> str:
     """Return a table with a row for each trajectory: its sample's answer, and the last frame's scores."""
     shown = []
@@ -215,13 +191,3 @@ def score_step(url: str, models: Sequence[str]) -> tuple[str, str]:
         return "score random embeddings", command("rfm-client", "sample", *options)
     options += [] if DEFAULT_MODEL in models else ["--model", models[0]]
     return "score a video", command("rfm-client", "score", "VIDEO", "--task", "TASK", *options)
-
-
-def steps_with_server(url: str, models: Sequence[str]) -> str:
-    """Return what to try with a running server. models: those that score frames."""
-    steps = [score_step(url, models)]
-    if models:
-        options = [] if DEFAULT_MODEL in models else ["--model", models[0]]
-        page = command("rfm-client", "gateway", "--port", PAGE_PORT, "--triton", url, *options)
-        steps.append((f"serve the page at {PAGE_URL}", page))
-    return next_steps(*steps)

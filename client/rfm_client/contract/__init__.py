@@ -16,7 +16,6 @@ from rfm_client.contract.errors import (
 )
 from rfm_client.contract.results import (
     FRAME_SCORES,
-    BatchTiming,
     FrameScores,
     PreferenceResult,
     ProgressResult,
@@ -35,7 +34,6 @@ from rfm_client.contract.samples import (
 __all__ = [
     "FRAME_SCORES",
     "AccessDeniedError",
-    "BatchTiming",
     "ClientClosedError",
     "DeadlineExceededError",
     "FrameScores",

@@ -25,9 +25,8 @@ from rfm_client.contract.settings import ConfigError
 MAX_PORT = 65535
 
 _URL = re.compile(
-    r"((?P<scheme>grpcs?|https?)://|dns:///)(?P<address>(\[[\da-fA-F:.]+(%\w+)?\]|[^][:/@\s]+):(?P<port>\d{1,5}))/?"
+    r"(?P<scheme>grpcs?|https?)://(?P<address>(\[[\da-fA-F:.]+(%\w+)?\]|[^][:/@\s]+):(?P<port>\d{1,5}))/?"
 )
-_PORTS = {"grpc": 8001, "http": 8000}
 _OPENSSL_REASONS = {
     "NO_CERTIFICATE_OR_CRL_FOUND": "a file without certificate",
     "KEY_VALUES_MISMATCH": "the key of another certificate",
@@ -39,16 +38,13 @@ _OPENSSL_REASONS = {
 def split_url(url: str) -> tuple[str, str]:
     """Return a URL's scheme (``grpc``, ``http``, ``grpcs`` or ``https``) and ``host:port``. Raises ValueError.
 
-    ``dns:///host:port``, gRPC's own form, means ``grpc://host:port``. An IPv6 address needs brackets.
+    An IPv6 address needs brackets.
     """
-    scheme, _, address = url.rstrip("/").partition("://")
-    for host, port in (address.rpartition(":")[::2], (address, str(_PORTS.get(scheme.removesuffix("s"), 8000)))):
-        if _is_ipv6(host):
-            raise InvalidValueError.at("url", f"brackets around an IPv6 address, {scheme}://[{host}]:{port}", repr(url))
     match = _URL.fullmatch(url)
     if match is None or int(match["port"]) > MAX_PORT:
-        raise InvalidValueError.at("url", "grpc://host:port or http://host:port, or grpcs:// or https://", repr(url))
-    return match["scheme"] or "grpc", match["address"]
+        expected = "grpc://host:port or http://host:port, or grpcs:// or https:// (brackets around an IPv6 address)"
+        raise InvalidValueError.at("url", expected, repr(url))
+    return match["scheme"], match["address"]
 
 
 def host_of(address: str) -> str:
@@ -62,13 +58,6 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host.lower() == "localhost"
-
-
-def _is_ipv6(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).version == 6
-    except ValueError:
-        return False
 
 
 def check_certificate(certificate: str | Path, key: str | Path, where: str) -> None:
@@ -145,16 +134,22 @@ _NO_PROXY_VARIABLES = ("no_grpc_proxy", "no_proxy")
 _CREDENTIALS = re.compile(r"[^/@]*@")
 
 
-def grpc_proxy(address: str) -> str | None:
-    """Return ``VARIABLE=VALUE`` for the proxy that gRPC uses for ``host:port``, without a password; None: no proxy."""
-    host = host_of(address)
-    name = next((name for name in _PROXY_VARIABLES if name in os.environ), None)
-    if name is None or not os.environ[name] or is_loopback(host):
+def grpc_proxy(url: str) -> str | None:
+    """Return ``VARIABLE=VALUE`` for the proxy that gRPC uses for the server, without a password; None: no proxy."""
+    scheme, address = split_url(url)
+    name, value = next(((name, os.environ[name]) for name in _PROXY_VARIABLES if name in os.environ), ("", ""))
+    if not value or not scheme.startswith("grpc") or is_loopback(host_of(address)):
         return None
     excepted = next((os.environ[name] for name in _NO_PROXY_VARIABLES if name in os.environ), "")
-    if any(_matches(host, entry.strip()) for entry in excepted.split(",") if entry.strip()):
+    if any(_covers(entry.strip(), host_of(address)) for entry in excepted.split(",") if entry.strip()):
         return None
-    return _shown(name, os.environ[name])
+    return _shown(name, value)
+
+
+def with_proxy(url: str) -> str:
+    """Return the server's URL for an error message, with gRPC's proxy if there is one."""
+    proxy = grpc_proxy(url)
+    return f"{url} through {proxy}" if proxy else url
 
 
 def open_url(url: str, timeout_s: float) -> Any:
@@ -165,12 +160,12 @@ def open_url(url: str, timeout_s: float) -> Any:
         return urllib.request.build_opener(proxies).open(url, timeout=timeout_s)
     except OSError as error:
         proxy = urllib.request.getproxies().get(scheme)
-        if not proxy or urllib.request.proxy_bypass(host):
+        if not proxy or is_loopback(host) or urllib.request.proxy_bypass(host):
             raise
         raise OSError(f"{error} (through {_shown(f'{scheme}_proxy', proxy)})") from error
 
 
-def _matches(host: str, entry: str) -> bool:
+def _covers(entry: str, host: str) -> bool:
     """True if a no_proxy entry covers the host by gRPC's rules: a name's ending, or a network (CIDR)."""
     if host.lower().endswith(entry.lower()):
         return True

@@ -1,19 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Errors for invalid values, which carry fields, and errors from a call to the server.
-
-    RewardError
-    +-- InvalidSampleError        the sample is at fault; a retry gives the same answer
-    +-- ClientClosedError         the client was closed before or during the call
-    +-- ServerError               the server is at fault or unreachable
-        +-- ServerUnavailableError    no connection, not ready, or a full queue
-            +-- ProcessEndedError     a process or the connection ended, perhaps because of this request
-        +-- DeadlineExceededError     no answer within the caller's time limit
-        +-- ModelNotFoundError        the server does not serve this model
-        +-- AccessDeniedError         client and server disagree on certificate, key or TLS
-        +-- InferenceFailedError      the server failed (see its log), or its answer is invalid
-
-An error never becomes a number.
-"""
+"""Errors for invalid values, which carry fields, and errors from a call to the server. No error becomes a number."""
 
 from __future__ import annotations
 
@@ -135,9 +121,7 @@ class ProcessEndedError(ServerUnavailableError):
 
 
 class DeadlineExceededError(ServerError, TimeoutError):
-    """No answer came within the caller's time limit. server: the URL, and its proxy; empty: unknown."""
-
-    server = ""
+    """No answer came within the caller's time limit."""
 
 
 class ModelNotFoundError(ServerError):

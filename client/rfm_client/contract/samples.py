@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.checks import require
-from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.errors import InvalidSampleError, InvalidValueError, LocatedError
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
 UInt8Array: TypeAlias = npt.NDArray[np.uint8]
@@ -116,8 +116,22 @@ class Trajectory:
             object.__setattr__(self, "goal", _checked_goal(self.goal))
 
 
+class _Sample:
+    @property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """The trajectories, in their order on the time axis."""
+        return tuple(each for each in vars(self).values() if isinstance(each, Trajectory))
+
+
+class _Pair(_Sample):
+    def __post_init__(self) -> None:
+        (where, first), (other_where, other) = vars(self).items()
+        _check_text(first, where)
+        _check_pair(first, other, other_where)
+
+
 @dataclass(frozen=True, eq=False)
-class ProgressSample:
+class ProgressSample(_Sample):
     """Question: how far is ``trajectory`` at each frame, and has it succeeded?
 
     frame_steps: 0 scores the trajectory as a whole. N >= 2 is dense mode: frame t is scored from its prefix 0..t alone,
@@ -129,29 +143,19 @@ class ProgressSample:
 
     def __post_init__(self) -> None:
         _check_text(self.trajectory, "trajectory")
-        check_frame_steps(self.frame_steps)
-
-    @property
-    def trajectories(self) -> tuple[Trajectory, ...]:
-        """The trajectories, in their order on the time axis."""
-        return (self.trajectory,)
+        steps: Any = self.frame_steps
+        is_whole = isinstance(steps, (int, np.integer)) and not isinstance(steps, bool)
+        is_valid = is_whole and (steps == 0 or MIN_FRAME_STEPS <= steps <= MAX_FRAME_STEPS)
+        expected = f"0 or a whole number from {MIN_FRAME_STEPS} to {MAX_FRAME_STEPS}"
+        require("frame_steps", is_valid, expected, repr(steps), InvalidSampleError)
 
 
 @dataclass(frozen=True, eq=False)
-class PreferenceSample:
+class PreferenceSample(_Pair):
     """Question: which trajectory does ``first``'s task better?"""
 
     first: Trajectory
     second: Trajectory
-
-    def __post_init__(self) -> None:
-        _check_text(self.first, "first")
-        _check_pair(self.first, self.second, "second")
-
-    @property
-    def trajectories(self) -> tuple[Trajectory, ...]:
-        """The trajectories, in their order on the time axis."""
-        return (self.first, self.second)
 
     @property
     def swapped(self) -> PreferenceSample:
@@ -161,20 +165,11 @@ class PreferenceSample:
 
 
 @dataclass(frozen=True, eq=False)
-class SimilaritySample:
+class SimilaritySample(_Pair):
     """Question: how similar is ``other`` to ``reference`` in doing ``reference``'s task?"""
 
     reference: Trajectory
     other: Trajectory
-
-    def __post_init__(self) -> None:
-        _check_text(self.reference, "reference")
-        _check_pair(self.reference, self.other, "other")
-
-    @property
-    def trajectories(self) -> tuple[Trajectory, ...]:
-        """The trajectories, in their order on the time axis."""
-        return (self.reference, self.other)
 
 
 Sample: TypeAlias = ProgressSample | PreferenceSample | SimilaritySample
@@ -188,14 +183,6 @@ class EncoderSample:
     """
 
     trajectories: tuple[Trajectory, ...]
-
-
-def check_frame_steps(steps: Any) -> None:
-    """Raise InvalidSampleError unless ``steps`` is 0 or a valid frame count for dense mode."""
-    is_whole = isinstance(steps, (int, np.integer)) and not isinstance(steps, bool)
-    if not is_whole or not (steps == 0 or MIN_FRAME_STEPS <= steps <= MAX_FRAME_STEPS):
-        expected = f"0 or a whole number from {MIN_FRAME_STEPS} to {MAX_FRAME_STEPS}"
-        raise InvalidSampleError.at("frame_steps", expected, repr(steps))
 
 
 def check_task(task: Any) -> None:
@@ -261,11 +248,13 @@ def as_array(values: Any) -> npt.NDArray[Any]:
     return np.asarray(values)
 
 
-def checked_mask(where: str, mask: npt.ArrayLike, count: int) -> npt.NDArray[np.bool_]:
-    """Return a mask, bool [count], given as an array, list or tensor. Raises ValueError."""
+def checked_mask(
+    where: str, mask: npt.ArrayLike, count: int, error: type[LocatedError] = InvalidValueError
+) -> npt.NDArray[np.bool_]:
+    """Return a mask, bool [count], given as an array, list or tensor. Raises ``error``."""
     array = as_array(mask)
     is_mask = array.dtype == np.bool_ and array.shape == (count,)
-    require(where, is_mask, f"bool [{count}]", f"{array.dtype} {list(array.shape)}")
+    require(where, is_mask, f"bool [{count}]", f"{array.dtype} {list(array.shape)}", error)
     return array
 
 

@@ -11,9 +11,9 @@ import os
 import re
 from collections.abc import Callable, Collection
 from typing import Any, TypeAlias, TypeVar
-from urllib.parse import urljoin
 
 from rfm_client.contract import errors
+from rfm_client.contract.addresses import grpc_proxy, with_proxy
 from rfm_client.contract.wire import GOAL, NUM_FRAMES, SECOND_FRAMES, VIEWS, frames_name
 
 BadRequest: TypeAlias = Callable[[str], errors.RewardError]
@@ -25,8 +25,6 @@ BAD_GATEWAY = ("502",)  # a proxy's connection to the server ended or was refuse
 DENIED = ("StatusCode.UNAUTHENTICATED", "StatusCode.PERMISSION_DENIED", "401", "403")
 
 _ServerError = TypeVar("_ServerError", bound=errors.ServerError)
-
-_REDIRECTS = range(300, 400)
 
 _ERRORS: dict[tuple[str, ...], type[errors.RewardError]] = {
     ("StatusCode.INVALID_ARGUMENT", "400"): errors.InvalidSampleError,
@@ -48,6 +46,7 @@ _NO_CONNECTION = re.compile(  # gRPC's own messages: nothing was sent
     "failed to connect|connections to all backends failing|errors resolving|resolution failed"
 )
 _REASON = re.compile(r"(?:: |\[)((?:Connection|Domain name|Name|No route|Network)[\w ]+)\]?$")  # from libc or gRPC
+_NO_GRPC = re.compile("Failed parsing HTTP/2|http1|: Socket closed")  # another protocol's answer
 _PROXY_ALONE = "http2 header with status: 502"  # a proxy answered, but the server behind it did not
 _LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # or a proxy's
 _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|{RESTRICTED}")
@@ -58,27 +57,27 @@ _NO_INPUT = re.compile(
     r"(?:expected (?:number of inputs between \d+ and )?\d+ (?:inputs )?but got .*|unexpected .*input )"
     rf"'(?P<name>{'|'.join((SECOND_FRAMES, *VIEWS, GOAL))})'"
 )
-_WITHOUT_VIEWS = (
+_OF_PAIRS = (  # a model that has the input, one that lacks it, and the remedy
+    "a model that takes pairs of two frame sizes",
+    "one that was exported before there was this input",
+    "export it again, or resize a trajectory",
+)
+_OF_VIEWS = (
     "a model that reads views and a goal, such as Robo-Dopamine",
     "one that reads the frames of one camera",
     "leave out views and goal",
 )
-_OLD = "one that was exported before there was this input"
-# By optional input: a model that has it, one that lacks it, and the remedy.
-_WITHOUT = {
-    SECOND_FRAMES: ("a model that takes pairs of two frame sizes", _OLD, "export it again, or resize a trajectory"),
-    **dict.fromkeys((*VIEWS, GOAL), _WITHOUT_VIEWS),
-}
 _NO_OUTPUT = re.compile(r"unexpected inference output '(\w+)'")
 _FIELDS = re.compile(r"(\S+): expected (.*?), got (.*)", re.DOTALL)  # as written by ``LocatedError``
 _PREFIX = re.compile(r"^(\[request id: [^\]]*\] )?(in ensemble '[^']*', )?")  # the caller knows both
 
 FEWER_FRAMES = "score some of them (subsample=True), each on few before it (frame_steps), or by a sampling rule"
-_START = "start the server there (rfm serve), or give the URL of one that runs"
-_NO_PROXY = "unset that variable, or add the server's host to no_proxy"
+_START = "start the server there (rfm serve), or give the URL of one that runs (with TLS: grpcs:// or https://)"
+_GRPC_PORT = "give that port, or http:// for the HTTP port, or grpcs:// with TLS"
 _NAME = "give the checkpoint's name with model (--model)"
 _SHOW_KEY = "show the key that it wants with api_key (--api-key-file) or headers"
 _TRUST = {
+    "WRONG_VERSION_NUMBER": "use grpc:// or http:// for a server without TLS",
     "[Hh]ostname|IP address mismatch": "use a host name in the URL that its certificate has",
     "expired|not yet valid": "renew its certificate, or set the clock",
     "(?i)verify.failed": "name its authority, or its self-signed certificate itself, with ca_file (--ca-file)",
@@ -99,31 +98,24 @@ def invalid_sample(text: str) -> errors.InvalidSampleError:
     return errors.InvalidSampleError.at(where, expected, got, FEWER_FRAMES if has_too_many else "")
 
 
-def error_from(
-    raised: Exception,
-    url: str,
-    *,
-    proxy: str | None = None,
-    bad_request: BadRequest = invalid_sample,
-) -> errors.RewardError | None:
+def error_from(raised: Exception, url: str, bad_request: BadRequest = invalid_sample) -> errors.RewardError | None:
     """Translate an exception from tritonclient or a library below it; None: any other exception.
 
-    proxy: the call's proxy (``grpc_proxy``)
     bad_request: makes the error for the status INVALID_ARGUMENT, which Triton also gives for an unknown model
     """
-    where = f"{url} through {proxy}" if proxy else url
     for kind in type(raised).__mro__:  # by name, because these libraries may not be imported
         match kind.__name__:
             case "InferenceServerException":
-                return _error_of_answer(raised, url, proxy, bad_request)
+                return _error_of_answer(raised, url, bad_request)
             case "TimeoutError":  # in Python 3.10 asyncio has its own class
-                late = errors.DeadlineExceededError(f"{where}: no answer in time")
-                late.server = where
-                return late
+                return errors.DeadlineExceededError(f"{with_proxy(url)}: no answer in time")
             case "SSLError" | "ClientSSLError":
                 return denied(url, "", str(raised))
             case "ClientResponseError":
-                return errors.InferenceFailedError(f"{url}: no answer of an HTTP server: {type(raised).__name__}")
+                return errors.InferenceFailedError(
+                    f"{url}: expected an answer of Triton's HTTP port (by default 8000), got {type(raised).__name__}; "
+                    "use grpc:// for its gRPC port"
+                )
             case "ClientConnectorError" | "OSError" | "EOFError" | "HTTPException":
                 number = getattr(raised, "errno", None) or 0
                 return unreachable(url, os.strerror(number) if number > 0 else str(raised) or type(raised).__name__)
@@ -132,16 +124,17 @@ def error_from(
                 lost.may_have_ended_server = True
                 return lost
             case "ValueError" | "LookupError" | "TypeError" | "AttributeError":  # from an answer that is not Triton's
-                return errors.InferenceFailedError(f"{url}: the answer cannot be read: {raised!r}")
+                expected = "an answer of Triton's HTTP port (by default 8000) or gRPC port (8001)"
+                return errors.InferenceFailedError(f"{url}: expected {expected}, got an unreadable one: {raised!r}")
     return None
 
 
-def _error_of_answer(answer: Any, url: str, proxy: str | None, bad_request: BadRequest) -> errors.RewardError:
+def _error_of_answer(answer: Any, url: str, bad_request: BadRequest) -> errors.RewardError:
     status, message = str(answer.status()), answer.message() or ""
     if is_denied(status, message):
         return denied(url, status, message)
     if status == "StatusCode.UNAVAILABLE" and (_NO_CONNECTION.search(message) or _PROXY_ALONE in message):
-        return unreachable(url, message, proxy)
+        return unreachable(url, message)
     return error_of(status, message, bad_request)
 
 
@@ -153,8 +146,9 @@ def error_of(status: str, message: str, bad_request: BadRequest) -> errors.Rewar
         return errors.InvalidSampleError.at(shape["name"], f"[{shape['expected']}]", f"[{shape['got']}]")
     without = _NO_INPUT.search(text)
     if without is not None:
-        expected, got, remedy = _WITHOUT[without["name"]]
-        return errors.InvalidSampleError.at(without["name"], expected, got, remedy)
+        return errors.InvalidSampleError.at(
+            without["name"], *(_OF_PAIRS if without["name"] == SECOND_FRAMES else _OF_VIEWS)
+        )
     if PROCESS_ENDED in text and "Stub process" in text:
         return errors.ProcessEndedError(text)
     if LOST_REGION in text or f"has {NO_VERSIONS}" in text:  # the sample is not at fault: a retry may succeed
@@ -167,20 +161,6 @@ def error_of(status: str, message: str, bad_request: BadRequest) -> errors.Rewar
     return error
 
 
-def is_redirect(status: int) -> bool:
-    """True for an HTTP status that names another address."""
-    return status in _REDIRECTS
-
-
-def redirected(url: str, location: str) -> errors.InferenceFailedError:
-    """Return the error for a redirect, which no call follows. location: from the answer's header."""
-    target = urljoin(url, location)
-    return errors.InferenceFailedError(
-        f"{url}: expected an answer of Triton, got a redirect to {target!r:.200}: give that server's address as URL if "
-        "you trust it"
-    )
-
-
 def is_denied(status: str, message: str) -> bool:
     """True if one side refused the other: a missing or wrong key, or an untrusted certificate."""
     return status in DENIED or (status == "StatusCode.UNAVAILABLE" and _NO_TRUST.search(message) is not None)
@@ -188,20 +168,21 @@ def is_denied(status: str, message: str) -> bool:
 
 def denied(url: str, status: str, message: str) -> errors.AccessDeniedError:
     """Return the error for a refused connection or request, with its remedy."""
-    is_keyed = status in DENIED or RESTRICTED in message
-    fitting = (remedy for words, remedy in _TRUST.items() if re.search(words, message))
-    remedy = _SHOW_KEY if is_keyed else next(fitting, "")
+    remedy = next((remedy for words, remedy in _TRUST.items() if re.search(words, message)), "")
+    if status in DENIED or RESTRICTED in message:
+        remedy = _SHOW_KEY
     return _with_remedy(errors.AccessDeniedError, f"{url}: access denied: {message}", remedy)
 
 
-def unreachable(url: str, reason: str, proxy: str | None = None) -> errors.ServerUnavailableError:
+def unreachable(url: str, reason: str) -> errors.ServerUnavailableError:
     """Return the error for a failed connection to the server or its proxy."""
     found = _REASON.search(reason)
-    reason = found[1] if found else reason
-    if proxy is None:
-        return _with_remedy(errors.ServerUnavailableError, f"{url}: no connection: {reason}", _START)
-    fault = f"{url}: no connection through {proxy}: {reason}"
-    return _with_remedy(errors.ServerUnavailableError, fault, _NO_PROXY)
+    reason, remedy = (found[1] if found else reason), _START
+    if url.startswith("grpc") and _NO_GRPC.search(reason):
+        reason, remedy = "no answer of Triton's gRPC port (by default 8001)", _GRPC_PORT
+    if grpc_proxy(url):
+        remedy += "; or add the host to no_proxy, unless this proxy leads to it"
+    return _with_remedy(errors.ServerUnavailableError, f"{with_proxy(url)}: no connection: {reason}", remedy)
 
 
 def not_served(model: str, message: str, served: Collection[str]) -> errors.ModelNotFoundError:

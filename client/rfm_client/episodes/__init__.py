@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Episodes that grow: each step sends only new frames, and returns the score for the episode so far."""
 
-from rfm_client.episodes.episodes import AsyncEpisode, AsyncEpisodes, Episode, Episodes
+from rfm_client.episodes.episodes import Episode
 from rfm_client.episodes.options import EpisodeOptions, FrameOptions, StepScore, SuccessRule
 
 __all__ = [
-    "AsyncEpisode",
-    "AsyncEpisodes",
     "Episode",
     "EpisodeOptions",
-    "Episodes",
     "FrameOptions",
     "StepScore",
     "SuccessRule",

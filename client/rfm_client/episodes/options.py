@@ -5,15 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias, TypedDict, get_args
-
-import numpy as np
-import numpy.typing as npt
+from typing import Literal, TypeAlias, TypedDict, get_args
 
 from rfm_client.contract.checks import checked_count, checked_share, require
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.results import SUCCESS_THRESHOLD
-from rfm_client.contract.samples import Float32Array
 from rfm_client.frames.orientation import FUSES, ChannelOrder, Correction, Fuse, Orientation
 from rfm_client.frames.sampling import Rule, Sampling
 
@@ -28,7 +24,7 @@ class StepScore:
     success: probability that the task is done; NaN: the checkpoint does not predict success
     succeeded: True if the success rule holds; False where success is NaN
     step: the scored frame's index in the episode, from 0
-    ms: milliseconds to the answer, without the wait for an open ``add_nowait`` request
+    ms: milliseconds to the answer
     more_scores: other scores for the frame, by name in ``FRAME_SCORES``: marks as bool, numbers as float. With several
         cameras, numbers are fused, and a mark is True if any camera has it
     """
@@ -48,36 +44,6 @@ class StepScore:
     def value(self, score: StepValue) -> float:
         """Return the number that grows towards task completion: progress, or minus the remaining seconds."""
         return self.progress if score == "progress" else -self.more_scores[score]
-
-
-@dataclass(frozen=True, eq=False)
-class StepScores:
-    """Scores for N episodes at their newest frames.
-
-    progress, success: float32 [N], as in StepScore; NaN where ``mask`` left an episode out
-    succeeded: bool [N]; False where ``mask`` left an episode out, or success is NaN
-    step: int64 [N], the newest frame's index, from 0; -1: none yet
-    ms: time to the answer, in milliseconds
-    more_scores: by name an array [N], as in StepScore: bool for marks, else float32 with NaN where there is none
-    """
-
-    progress: Float32Array
-    success: Float32Array
-    succeeded: npt.NDArray[np.bool_]
-    step: npt.NDArray[np.int64]
-    ms: float
-    more_scores: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
-
-    @property
-    def unclear(self) -> npt.NDArray[np.bool_]:
-        """bool [N], as in StepScore."""
-        return self.more_scores.get("unclear", np.zeros(len(self.progress), bool))
-
-    def of(self, index: int) -> StepScore:
-        """Return one episode's score."""
-        numbers = float(self.progress[index]), float(self.success[index])
-        more = {name: values[index].item() for name, values in self.more_scores.items()}
-        return StepScore(*numbers, bool(self.succeeded[index]), int(self.step[index]), self.ms, more)
 
 
 @dataclass(frozen=True)

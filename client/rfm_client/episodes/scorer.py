@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import random
-import time
 from collections import Counter, OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
@@ -74,15 +73,12 @@ class StepScorer:
         """Describe the model that scores windows. Raises RewardError."""
         return await self._scorer.model_info(self._model, call.deadline)
 
-    async def scores(self, asked: Sequence[Asked], call: Call, asked_s: float) -> list[StepScore]:
-        """Return a score for each step, from as few requests as possible. Raises RewardError, ValueError.
-
-        asked_s: when the caller began to wait, by ``time.perf_counter``
-        """
+    async def scores(self, asked: Sequence[Asked], call: Call) -> list[StepScore]:
+        """Return a score for each step, from as few requests as possible. Raises RewardError, ValueError."""
         info = await self.model_info(call)
         shown = [steps.windows(step, info) for steps, step in asked]
         outcomes = iter(await self._all_outcomes([each for _, windows in shown for each in windows], info, call))
-        ms = (time.perf_counter() - asked_s) * 1e3
+        ms = call.deadline.passed_s * 1e3
         return [
             steps.score(step, prefix, list(islice(outcomes, len(windows))), ms)
             for (steps, step), (prefix, windows) in zip(asked, shown, strict=True)
@@ -168,13 +164,12 @@ class StepScorer:
     ) -> Sequence[ProgressResult]:
         request_id = next(call.request_ids)
         num_bytes = _padded_bytes(len(windows), len(sent), sent[0].nbytes if sent else 0)
-        videos, tasks = [window.digests for window in windows], [window.task for window in windows]
+        videos, tasks = (
+            [[frame.digest for frame in window.frames] for window in windows],
+            [window.task for window in windows],
+        )
         tensors = partial(wire.encode_refs, videos, tasks, sent)
-        try:
-            answer = await self._scorer.infer(self._model, num_bytes, tensors, outputs, call, request_id)
-        except RewardError as error:
-            error.request_id = request_id
-            raise
+        answer = await self._scorer.infer(self._model, num_bytes, tensors, outputs, call, request_id)
         return [
             wire.decode_progress(answer.tensors, row, len(window.frames), answer.model_version)
             for row, window in enumerate(windows)

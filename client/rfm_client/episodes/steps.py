@@ -61,11 +61,6 @@ class Window:
         frames = np.stack([frame.pixels for frame in self.frames])
         return ProgressSample(Trajectory(frames=frames, task=self.task))
 
-    @property
-    def digests(self) -> list[bytes]:
-        """The frames' digests, in order."""
-        return [frame.digest for frame in self.frames]
-
 
 class Steps:
     """One episode's frames so far.
@@ -77,12 +72,12 @@ class Steps:
         self.task, self.options = task, options
         self._where = where
         self._corrections = options.corrections
-        self._frames: list[tuple[Frame, ...]] = []  # by step and camera
+        self.frames: list[tuple[Frame, ...]] = []  # by step and camera
 
     @property
     def newest(self) -> int:
         """The newest step's index, from 0; -1: none yet."""
-        return len(self._frames) - 1
+        return len(self.frames) - 1
 
     def anew(self, task: str | None) -> Steps:
         """Return the next episode, without frames. task: None: as before."""
@@ -99,7 +94,7 @@ class Steps:
         try:
             check_cameras("frame", frame, cameras)
             given = {f"frame[{camera!r}]": frame[camera] for camera in cameras} or {"frame": frame}
-            firsts = self._frames[0] if self._frames else (None,) * len(given)
+            firsts = self.frames[0] if self.frames else (None,) * len(given)
             for (where, each), correction, first in zip(given.items(), self._corrections, firsts, strict=True):
                 pixels = correction.applied(checked_frame(each, where))
                 if size is not None:
@@ -113,14 +108,6 @@ class Steps:
             raise self._located(error) from None
         return tuple(kept)
 
-    def append(self, frame: tuple[Frame, ...]) -> None:
-        """Add the frames that ``checked`` returned."""
-        self._frames.append(frame)
-
-    def remove(self, frame: tuple[Frame, ...]) -> None:
-        """Remove a frame again, as if it had never been added."""
-        self._frames.remove(frame)
-
     def windows(self, step: int, info: ModelInfo) -> tuple[Prefix, list[Window]]:
         """Return how a step is sampled, and each camera's window: its sampled frames, and the task.
 
@@ -129,7 +116,7 @@ class Steps:
         prefix = self.options.sampling_for(info).prefix(max(step, 0))
         try:
             require("frame", step >= 0, "one to score", "none yet", InvalidSampleError)
-            shown = [self._frames[index] for index in prefix.indices]
+            shown = [self.frames[index] for index in prefix.indices]
             return prefix, [Window(frames, self.task, self) for frames in zip(*shown, strict=True)]
         except InvalidSampleError as error:
             raise self._located(error) from None
@@ -189,14 +176,7 @@ def check_cameras(where: str, frames: Any, cameras: Sequence[str]) -> None:
 
 def checked_frame(frame: Any, where: str) -> UInt8Array:
     """Copy a frame, uint8 [H, W, 3], so that the caller may reuse the array. Raises InvalidSampleError."""
-    kept = copied(frame)
+    kept = np.array(as_array(frame))
     is_frame = kept.dtype == np.uint8 and kept.ndim == 3 and kept.shape[2] == 3 and 0 not in kept.shape
     require(where, is_frame, "uint8 [H, W, 3]", f"{kept.dtype} {list(kept.shape)}", InvalidSampleError)
     return cast(UInt8Array, kept)
-
-
-def copied(frame: Any) -> Any:
-    """Copy a frame, or a dict of frames by camera."""
-    if isinstance(frame, Mapping):
-        return {camera: np.array(as_array(each)) for camera, each in frame.items()}
-    return np.array(as_array(frame))

@@ -19,11 +19,6 @@ _RANGE = 4  # widest range in a flat channel: JPEG, H.264 and AV1 spread a flat 
 _PROBED_PX = 16  # the coarse grid, which rules out almost all frames, has at least this many rows and columns
 
 
-def is_black(frame: UInt8Array) -> bool:
-    """True if a frame, uint8 [H, W, 3], looks black to the eye."""
-    return int(frame.max()) <= _BLACK
-
-
 def is_blank(frame: UInt8Array) -> bool:
     """True if a frame, uint8 [H, W, 3], is black or single-coloured."""
     step = max(min(frame.shape[:2]) // _PROBED_PX, 1)
@@ -81,4 +76,4 @@ class BlankFrames:
 
 
 def _is_flat(pixels: UInt8Array) -> bool:
-    return is_black(pixels) or all(int(np.ptp(pixels[..., channel])) <= _RANGE for channel in range(3))
+    return int(pixels.max()) <= _BLACK or all(int(np.ptp(pixels[..., channel])) <= _RANGE for channel in range(3))

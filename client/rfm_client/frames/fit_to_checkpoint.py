@@ -20,15 +20,6 @@ from rfm_client.contract.samples import ProgressSample, Sample, Trajectory, UInt
 from rfm_client.frames.sampling import FrameIndices, taken, thinned
 
 
-def load_pillow() -> Any:
-    """Return Pillow's ``Image``. Raises ImportError, naming the extra to install."""
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise ImportError('making frames smaller needs Pillow: pip install "./client[resize]"') from error
-    return Image
-
-
 def resize_frames(frames: UInt8Array, size: FrameSize) -> UInt8Array:
     """Return frames, uint8 [T, H, W, 3], no larger than the model's input size; the same array if they fit.
 
@@ -36,7 +27,10 @@ def resize_frames(frames: UInt8Array, size: FrameSize) -> UInt8Array:
     the input stays identical if they read the size ``exact``. If they round the size to whole patches, frames are
     resized twice, and single pixels differ by up to 15.
     """
-    Image = load_pillow()  # noqa: N806  Pillow's spelling
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError('making frames smaller needs Pillow: pip install "./client[resize]"') from error
     height, width = size.fitted(frames.shape[1], frames.shape[2])
     if (height, width) == frames.shape[1:3]:
         return frames

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Load trajectories from files, URLs, and robot dataset steps.
+"""Load trajectories from files and robot dataset steps.
 
 T steps, H x W pixels, D embedding width. Any array may be a torch tensor, also on a GPU or with a gradient; torch
 is not imported.
@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from rfm_client.contract.checks import git_lfs_pointer, require
 from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.contract.samples import Trajectory, UInt8Array, as_array, with_pictures
+from rfm_client.contract.samples import Trajectory, UInt8Array, as_array, checked_mask, with_pictures
 from rfm_client.frames.orientation import ChannelOrder, Correction, Orientation
 from rfm_client.frames.pictures import FrameFileError, Picture, upright_picture
 from rfm_client.frames.video import is_url, read_video
@@ -51,17 +51,17 @@ def load_trajectory(
     views: Sequence[str | Path] = (),
     goal: str | Path | None = None,
 ) -> Trajectory:
-    """Return the trajectory in a file or behind an http(s) URL.
+    """Return the trajectory in a file.
 
     ``.npy``: frames, or embeddings [T, D]. ``.npz``: ``frames``, or ``video_embeddings`` and ``text_embedding``; and
-    ``task``, as in ``as_trajectory``. All other files, and all URLs, are videos, as in ``read_video``.
+    ``task``, as in ``as_trajectory``. All other files are videos, as in ``read_video``.
 
     task: replaces the file's task
     fps: frames per second to sample from a video; None: all frames
     start_s, end_s: part of a video, in seconds since its first frame; None: from the start, to the end
     orient: turn that makes frames and views upright
     channels: colour order in stored frames and views
-    views: files or URLs with further cameras' frames, cut to the same part
+    views: files with further cameras' frames, cut to the same part
     goal: picture file, used as stored, upright by its EXIF data. Needs Pillow
 
     Raises InvalidSampleError, also for arrays of Python objects, because reading them runs code, and for a video with
@@ -139,11 +139,8 @@ def _unpadded(columns: Mapping[str, Any], key: str, values: Any) -> Any:
     """Return the values [T, ...] at the steps that are not padding. Without marks, return them unchanged."""
     if key + _IS_PAD not in columns or values is None:
         return values
-    steps, padding = as_array(values), as_array(columns[key + _IS_PAD])
-    is_of_steps = padding.dtype == bool and padding.shape == steps.shape[:1]
-    expected, got = f"bool {list(steps.shape[:1])}", f"{padding.dtype} {list(padding.shape)}"
-    require(key + _IS_PAD, is_of_steps, expected, got, InvalidSampleError)
-    return steps[~padding]
+    steps = as_array(values)
+    return steps[~checked_mask(key + _IS_PAD, columns[key + _IS_PAD], len(steps), InvalidSampleError)]
 
 
 def _corrected(trajectory: Trajectory, correction: Correction) -> Trajectory:
@@ -185,22 +182,18 @@ def _columns(steps: Iterable[Mapping[str, Any]]) -> Mapping[str, Any]:
 
 
 def _only(columns: Mapping[str, Any], key: str, default: Any) -> Any:
-    """Return the key's value, equal at all steps."""
-    values = _values(columns[key]) if key in columns else [default]
-    for value in values:
-        got = f"{values[0]!r} and {value!r}"
-        require(key, value == values[0], "the same at all steps", got, InvalidSampleError)
+    """Return the key's value, equal at all steps, given once or for each step, in any container."""
+    given = columns.get(key, default)
+    is_by_step = isinstance(given, Sequence) and not isinstance(given, (str, bytes))
+    try:
+        steps = [as_array(step).tolist() for step in (given if is_by_step else [given])]
+    except ValueError as error:  # numpy's, for rows of several lengths
+        raise InvalidSampleError.at(key, "the same at all steps", error) from None
+    for values in (steps, as_array(steps[:1]).reshape(-1).tolist()):
+        for value in values:
+            got = f"{values[0]!r} and {value!r}"
+            require(key, value == values[0], "the same at all steps", got, InvalidSampleError)
     return values[0] if values else default
-
-
-def _values(column: Any) -> list[Any]:
-    """Flatten a column: one value for all steps or one per step, in any container."""
-    if isinstance(column, str):
-        return [column]
-    if isinstance(column, Sequence):
-        return [value for part in column for value in _values(part)]
-    values: list[Any] = as_array(column).reshape(-1).tolist()
-    return values
 
 
 def _camera_key(columns: Mapping[str, Any], camera: str | None) -> str:

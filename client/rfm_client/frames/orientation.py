@@ -21,36 +21,12 @@ Orientation: TypeAlias = Literal["none", "rotate180", "flip-vertical", "flip-hor
 ChannelOrder: TypeAlias = Literal["rgb", "bgr"]
 
 
-def turned(frames: UInt8Array, orientation: Orientation) -> UInt8Array:
-    """Return frames, uint8 [..., H, W, 3], turned.
-
-    ``rotate90`` is a quarter turn clockwise; ``flip-vertical`` swaps top and bottom.
-
-    Raises ValueError for an unknown orientation.
-    """
-    _check("orient", get_args(Orientation), orientation)
-    if orientation == "none":
-        return frames
-    views = {
-        "rotate180": frames[..., ::-1, ::-1, :],
-        "flip-vertical": frames[..., ::-1, :, :],
-        "flip-horizontal": frames[..., ::-1, :],
-        "rotate90": np.swapaxes(frames[..., ::-1, :, :], -3, -2),
-        "rotate270": np.swapaxes(frames, -3, -2)[..., ::-1, :, :],
-    }
-    return np.ascontiguousarray(views[orientation])
-
-
-def _check(name: str, values: tuple[str, ...], value: object) -> None:
-    """Raise ValueError unless the value is valid for this option."""
-    require(name, value in values, f"one of {', '.join(values)}", repr(value), ConfigError)
-
-
 @dataclass(frozen=True)
 class Correction:
     """How to turn a camera's stored frames into upright RGB. Raises ValueError for an unknown value.
 
-    orient: rotation or flip that makes them upright
+    orient: rotation or flip that makes them upright. ``rotate90`` is a quarter turn clockwise; ``flip-vertical`` swaps
+        top and bottom
     channels: stored channel order
     """
 
@@ -58,8 +34,9 @@ class Correction:
     channels: ChannelOrder = "rgb"
 
     def __post_init__(self) -> None:
-        _check("orient", get_args(Orientation), self.orient)
-        _check("channels", get_args(ChannelOrder), self.channels)
+        for name, kind in (("orient", Orientation), ("channels", ChannelOrder)):
+            value, values = getattr(self, name), get_args(kind)
+            require(name, value in values, f"one of {', '.join(values)}", repr(value), ConfigError)
 
     @classmethod
     def of(
@@ -76,8 +53,18 @@ class Correction:
 
     def applied(self, frames: UInt8Array) -> UInt8Array:
         """Return stored frames, uint8 [..., H, W, 3], as upright RGB."""
-        is_rgb = self.channels == "rgb"
-        return turned(frames if is_rgb else np.ascontiguousarray(frames[..., ::-1]), self.orient)
+        if self == Correction():
+            return frames
+        rgb = frames if self.channels == "rgb" else frames[..., ::-1]
+        turned = {
+            "none": rgb,
+            "rotate180": rgb[..., ::-1, ::-1, :],
+            "flip-vertical": rgb[..., ::-1, :, :],
+            "flip-horizontal": rgb[..., ::-1, :],
+            "rotate90": np.swapaxes(rgb[..., ::-1, :, :], -3, -2),
+            "rotate270": np.swapaxes(rgb, -3, -2)[..., ::-1, :, :],
+        }
+        return np.ascontiguousarray(turned[self.orient])
 
 
 Fuse: TypeAlias = Literal["mean", "min", "max"]

@@ -61,12 +61,33 @@ class Picture:
 
     def check(self) -> None:
         """Raise FrameFileError unless the colours have 8 bits. Only the header is read."""
-        opened_picture(self._stored).close()
+        self._opened().close()
 
     def pixels(self) -> UInt8Array:
         """Return uint8 [H, W, 3], upright by EXIF. Raises FrameFileError."""
-        is_file = isinstance(self._stored, bytes | Path)
-        return decoded_picture(opened_picture(self._stored) if is_file else self._stored)
+        with self._opened() if isinstance(self._stored, bytes | Path) else self._stored as picture:
+            try:
+                return np.asarray(upright_picture(picture).convert("RGB"))
+            except _BROKEN as error:
+                raise FrameFileError.of("an image", error) from error
+
+    def _opened(self) -> Any:
+        """Open a picture of 8-bit colours, and read only the header. Raises FrameFileError."""
+        self.decoder()
+        from PIL import Image, UnidentifiedImageError
+
+        try:
+            opened = Image.open(_file_of(self._stored))
+        except UnidentifiedImageError as error:
+            raise FrameFileError.of("an image", git_lfs_pointer(self._stored) or error) from error
+        except (*_BROKEN, Image.DecompressionBombError) as error:
+            raise FrameFileError.of("an image", error) from error
+        is_deep = _DEEP in str(opened.tile)
+        if is_deep or opened.mode not in _COLOURS:
+            opened.close()
+            expected = "a picture of 8-bit colours (convert it, or leave a depth camera out: --cameras)"
+            raise FrameFileError.of(expected, f"{opened.format} of {'16-bit ' * is_deep}{opened.mode}")
+        return opened
 
     @property
     def exif_turn(self) -> int | None:
@@ -83,34 +104,6 @@ class Picture:
         except (*_BROKEN, Image.DecompressionBombError):  # ``check`` reports what is wrong
             return None
         return orientation if orientation in _UPRIGHT else None
-
-
-def opened_picture(picture: bytes | Path) -> Any:
-    """Open a picture of 8-bit colours, or its file, and read only the header. Raises FrameFileError."""
-    Picture.decoder()
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        opened = Image.open(_file_of(picture))
-    except UnidentifiedImageError as error:
-        raise FrameFileError.of("an image", git_lfs_pointer(picture) or error) from error
-    except (*_BROKEN, Image.DecompressionBombError) as error:
-        raise FrameFileError.of("an image", error) from error
-    is_deep = _DEEP in str(opened.tile)
-    if is_deep or opened.mode not in _COLOURS:
-        opened.close()
-        expected = "a picture of 8-bit colours (convert it, or leave a depth camera out: --cameras)"
-        raise FrameFileError.of(expected, f"{opened.format} of {'16-bit ' * is_deep}{opened.mode}")
-    return opened
-
-
-def decoded_picture(picture: Any) -> UInt8Array:
-    """Return an opened picture's pixels, uint8 [H, W, 3], upright by EXIF, and close it. Raises FrameFileError."""
-    with picture:
-        try:
-            return np.asarray(upright_picture(picture).convert("RGB"))
-        except _BROKEN as error:
-            raise FrameFileError.of("an image", error) from error
 
 
 def upright_picture(picture: Any) -> Any:

@@ -1,92 +1,60 @@
 # SPDX-License-Identifier: MIT
-"""Read frames from video files and URLs. Needs PyAV: ``pip install "./client[video]"``."""
+"""Read frames from video files. Needs PyAV: ``pip install "./client[video]"``."""
 
 from __future__ import annotations
 
 import itertools
 import math
-import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from http.client import HTTPException
 from pathlib import Path
-from tempfile import TemporaryFile
-from typing import Any, BinaryIO, TypeAlias
-from urllib.error import HTTPError
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.contract.addresses import open_url
 from rfm_client.contract.checks import checked_finite, checked_positive, require
 from rfm_client.contract.errors import InvalidSampleError, InvalidValueError
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.pictures import FrameFileError, decoded_picture, opened_picture
+from rfm_client.frames.pictures import FrameFileError
 from rfm_client.frames.video_decoding import (
     DAMAGED,
     DOWNLOAD,
     UNDAMAGED,
     Packets,
     Upright,
-    check_is_one_episode,
-    check_upright,
     import_av,
     judged,
-    read_packets,
-    video_stream,
 )
-
-DOWNLOAD_TIMEOUT_S = 60.0
+from rfm_client.frames.video_file import Video
 
 Take: TypeAlias = Callable[[int], object]
 
-_EXPECTED = "a file with a video stream"
 _LOST = (
     f"the decoder loses the others, as without a key frame before them: {DOWNLOAD}; or name a part: start_s of "
     "load_trajectory"
 )
 _REMUX = "extract the stream and encode it: ffmpeg -i IN -c copy RAW.h264; ffmpeg -framerate FPS -i RAW.h264 OUT.mp4"
 _RGB_BYTES = 3  # bytes per pixel
-_PICTURES = (b"\xff\xd8\xff", b"\x89PNG", b"RIFF", b"II*\0", b"MM\0*")  # first bytes: JPEG, PNG, WebP, TIFF
-_ANIMATED_WEBP = "webp_anim"  # FFmpeg's format, known to PyAV 19; before, it is one webp_pipe packet
-_WITH_PREVIEWS = "MPO"  # Pillow's name for a JPEG file with further, smaller pictures
-
-
-def frame_indices(total: int, native_fps: float, fps: float) -> npt.NDArray[np.int64]:
-    """Return int64 [T], which frames to show from a video with ``total`` frames at ``fps``.
-
-    As in upstream's example client: T = round(total * fps / native_fps), at least 1 and at most ``total``, evenly
-    spaced from first to last, rounded down.
-    """
-    count = min(max(round(total * fps / native_fps), 1), total)
-    return _spread(total, count)
-
-
-def is_url(source: str | Path) -> bool:
-    """True if ``read_video`` downloads the source."""
-    return isinstance(source, str) and source.lower().startswith(("http://", "https://"))
 
 
 def read_video(
-    source: str | Path,
+    file: str | Path,
     fps: float | None = None,
     *,
     start_s: float | None = None,
     end_s: float | None = None,
-    timeout_s: float = DOWNLOAD_TIMEOUT_S,
     take: Take | None = None,
     container: str | None = None,
 ) -> UInt8Array:
-    """Return uint8 [T, H, W, 3], the frames at ``fps`` from a video file or http(s) URL; None: all frames.
+    """Return uint8 [T, H, W, 3], the frames at ``fps`` from a video file; None: all frames.
 
     Frames are counted, not timed: at a variable frame rate, T follows the average rate, and frames are evenly spaced in
     number, not in time. Colours equal ``ffmpeg -pix_fmt rgb24`` with any PyAV. Frames are turned and mirrored as the
-    file says. A picture counts as a one-frame video. Only the returned frames stay in memory. A URL is downloaded
-    once, to a temporary file.
+    file says. Only the returned frames stay in memory.
 
     start_s, end_s: part from ``start_s`` to before ``end_s``, in seconds since the first frame;
         None: from the start, to the end
-    timeout_s: how long a URL's server may stay silent
     take: called with the byte count before each frame takes memory; an error in it ends the reading
     container: FFmpeg's name for the file format; None: FFmpeg guesses. Name it for untrusted files, because some
         formats make FFmpeg open other files or addresses
@@ -96,24 +64,21 @@ def read_video(
     (v3.0) without both ``start_s`` and ``end_s``.
     """
     import_av()
-    _check_numbers(fps, start_s, end_s, timeout_s)
+    _check_numbers(fps, start_s, end_s)
     take = take or (lambda num_bytes: None)
-    with _errors_of(source):
+    with _errors_of(file):
+        if is_url(file):
+            raise FrameFileError.at("", "a video file", "a URL", "download it first: curl -LO URL")
+        video = Video(Path(file), container)
         if start_s is None or end_s is None:
-            check_is_one_episode(source)
-        with _opened(source, timeout_s) as file:
-            is_part = (start_s, end_s) != (None, None)
-            picture = None if is_part or container is not None else _still(file)
-            if picture is not None:
-                return picture[np.newaxis]
-            check_upright(file)
-            packets = read_packets(file, container)
-            if not packets.fps and (is_part or fps is not None):
-                raise FrameFileError.of("a frame rate", "none")
-            if is_part:
-                frames = _part(file, packets, _within(packets, start_s, end_s), fps, take, container)
-            else:
-                frames = _whole(file, packets, fps, take, container)
+            video.check_is_one_episode()
+        is_part = (start_s, end_s) != (None, None)
+        if not video.packets.fps and (is_part or fps is not None):
+            raise FrameFileError.of("a frame rate", "none")
+        if is_part:
+            frames = _part(video, _within(video.packets, start_s, end_s), fps, take)
+        else:
+            frames = _whole(video, fps, take)
         if not frames:
             raise FrameFileError.of("at least one frame", "none")
         if len({frame.shape for frame in frames}) > 1:
@@ -122,14 +87,19 @@ def read_video(
         return np.stack(frames)
 
 
+def is_url(source: str | Path) -> bool:
+    """True for an address instead of a file."""
+    return str(source).lower().startswith(("http:/", "https:/"))  # Path drops a slash
+
+
 def frame_times_s(file: str | Path, num_frames: int, *, container: str | None = None) -> npt.NDArray[np.float64] | None:
     """Return float64 [T], frame times from 0 for ``read_video``; None: unknown.
 
     num_frames: T
     container: as in ``read_video``
     """
-    with _errors_of(file), Path(file).open("rb") as opened:
-        packets = read_packets(opened, container)
+    with _errors_of(file):
+        packets = Video(Path(file), container).packets
     if len(packets.times_s) < max(num_frames, packets.count):
         return None
     return packets.since_first_s[_spread(packets.count, num_frames)]
@@ -145,24 +115,12 @@ def _errors_of(source: str | Path) -> Iterator[None]:
     except InvalidSampleError as error:
         raise InvalidSampleError.like(error, source=str(source)) from error
     except (import_av().FFmpegError, OSError) as error:
-        located = InvalidSampleError.at("video", _EXPECTED, _read_instead(error))
-        if isinstance(error, FileNotFoundError):
-            located = InvalidSampleError.at("video", "a video file", "no file of this name")
+        located = InvalidSampleError.at("video", "a whole video file", error.strerror or error)
         raise InvalidSampleError.like(located, source=str(source)) from error
 
 
-def _read_instead(error: Exception) -> object:
-    """Say what was there instead of a video, without quoting FFmpeg or urllib."""
-    if isinstance(error, import_av().InvalidDataError):
-        return "a file of another kind, or a damaged one"
-    reason = getattr(error, "reason", None)  # from a URL
-    fault = reason if isinstance(reason, OSError) else error
-    return getattr(fault, "strerror", None) or fault
-
-
-def _check_numbers(fps: float | None, start_s: float | None, end_s: float | None, timeout_s: float) -> None:
+def _check_numbers(fps: float | None, start_s: float | None, end_s: float | None) -> None:
     try:
-        checked_positive("timeout_s", timeout_s)
         for where, number in (("fps", fps), ("end_s", end_s)):
             if number is not None:
                 checked_positive(where, number)
@@ -177,49 +135,6 @@ def _spread(total: int, count: int) -> npt.NDArray[np.int64]:
     return np.linspace(0, total - 1, count).astype(np.int64)
 
 
-@contextmanager
-def _opened(source: str | Path, timeout_s: float) -> Iterator[BinaryIO]:
-    if not is_url(source):
-        with Path(source).open("rb") as file:
-            yield file
-        return
-    with TemporaryFile() as copy:  # read twice, and an MP4's index may be at its end
-        _download(str(source), copy, timeout_s)
-        yield copy
-
-
-def _still(file: BinaryIO) -> UInt8Array | None:
-    """Return uint8 [H, W, 3], a single picture, upright by EXIF, which only some PyAV versions read; None: a video."""
-    beginning = file.read(max(map(len, _PICTURES)))
-    file.seek(0)
-    if not beginning.startswith(_PICTURES):
-        return None
-    with import_av().open(file) as opened:  # a picture stream has another format, or several packets
-        is_still = opened.format.name.endswith("_pipe") and sum(packet.size > 0 for packet in opened.demux()) == 1
-        is_still |= opened.format.name == _ANIMATED_WEBP
-    file.seek(0)
-    if not is_still:
-        return None
-    picture = opened_picture(file.read())
-    num_pictures = 1 if picture.format == _WITH_PREVIEWS else getattr(picture, "n_frames", 1)
-    if num_pictures > 1:
-        raise FrameFileError.of("a video, or a single picture", f"{num_pictures} pictures in a {picture.format} file")
-    return decoded_picture(picture)
-
-
-def _download(url: str, file: BinaryIO, timeout_s: float) -> None:
-    try:
-        with open_url(url, timeout_s) as response:
-            shutil.copyfileobj(response, file)
-            length = response.headers.get("Content-Length")
-        if length and file.tell() != int(length):  # urllib takes a broken connection for the end
-            raise OSError(f"{file.tell()} of {length} bytes came")
-    except (OSError, HTTPException, ValueError) as error:
-        if isinstance(error, HTTPError):
-            error.close()  # an HTTPError holds the connection
-        raise FrameFileError.of(_EXPECTED, _read_instead(error)) from error
-
-
 def _within(packets: Packets, start_s: float | None, end_s: float | None) -> tuple[int, int]:
     """Return the first frame numbers at or after ``start_s`` and ``end_s``, within half a frame."""
     half_s, times_s = 0.5 / packets.fps, packets.since_first_s
@@ -232,16 +147,20 @@ def _within(packets: Packets, start_s: float | None, end_s: float | None) -> tup
 
 
 def _picked(first: int, end: int, packets: Packets, fps: float | None) -> npt.NDArray[np.int64]:
-    own_fps, fps = (1.0, 1.0) if fps is None else (packets.fps, fps)
-    return first + frame_indices(end - first, own_fps, fps)
+    """Return int64 [T], which frames from ``first`` to before ``end`` to show at ``fps``.
+
+    As in upstream's example client: T = round(total * fps / native_fps), at least 1 and at most ``total``, evenly
+    spaced from first to last, rounded down.
+    """
+    total = end - first
+    return first + _spread(total, total if fps is None else min(max(round(total * fps / packets.fps), 1), total))
 
 
-def _whole(
-    file: BinaryIO, packets: Packets, fps: float | None, take: Take, container: str | None
-) -> Sequence[UInt8Array]:
+def _whole(video: Video, fps: float | None, take: Take) -> Sequence[UInt8Array]:
     """Return the frames at ``fps``, found by number, because some videos have no time stamps."""
+    packets = video.packets
     wanted = set(_picked(0, packets.count, packets, fps).tolist())
-    frames, times_s = _decoded(file, lambda number, _: number in wanted, take, container)
+    frames, times_s = _decoded(video, lambda number, _: number in wanted, take)
     total = len(times_s)
     if packets.num_hidden and not _rises(times_s):  # the hidden frames are not the ones meant
         expected = f"{packets.count + packets.num_hidden} frames ({_REMUX})"
@@ -250,17 +169,16 @@ def _whole(
         raise FrameFileError.of(f"{packets.count} frames, one for each packet", f"{total} ({_LOST})")
     if total > packets.count:  # a packet may hold several frames
         wanted = set(_picked(0, total, packets, fps).tolist())
-        frames, _ = _decoded(file, lambda number, _: number in wanted, take, container)
+        frames, _ = _decoded(video, lambda number, _: number in wanted, take)
     return frames
 
 
-def _part(
-    file: BinaryIO, packets: Packets, part: tuple[int, int], fps: float | None, take: Take, container: str | None
-) -> Sequence[UInt8Array]:
+def _part(video: Video, part: tuple[int, int], fps: float | None, take: Take) -> Sequence[UInt8Array]:
     """Return a part's frames at ``fps``, found by time stamp, because frames before it may be lost."""
+    packets = video.packets
     wanted_s = set(packets.times_s[_picked(*part, packets, fps)].tolist())
     begin_s, last_s = packets.times_s[part[0]], packets.times_s[part[1] - 1]
-    frames, times_s = _decoded(file, lambda _, time_s: time_s in wanted_s, take, container)
+    frames, times_s = _decoded(video, lambda _, time_s: time_s in wanted_s, take)
     if packets.count != len(packets.times_s) or None in times_s:
         raise FrameFileError.of(f"{packets.count} frames with time stamps", f"{len(packets.times_s)}")
     if not _rises(times_s):
@@ -277,31 +195,23 @@ def _rises(times_s: Sequence[float | None]) -> bool:
 
 
 def _decoded(
-    file: BinaryIO, is_wanted: Callable[[int, float | None], bool], take: Take, container: str | None
+    video: Video, is_wanted: Callable[[int, float | None], bool], take: Take
 ) -> tuple[Sequence[UInt8Array], Sequence[float | None]]:
     """Return the frames wanted by number and time, and the times of all frames; None: no time stamp."""
     picked: list[UInt8Array] = []
     times_s: list[float | None] = []
     upright = Upright()
-    file.seek(0)
-    with import_av().open(file, format=container) as opened:
-        for number, (frame, is_damaged) in enumerate(_judged(opened.decode(video_stream(opened)))):
-            times_s.append(None if frame.pts is None else float(frame.pts * frame.time_base))
-            is_picked = is_wanted(number, times_s[-1])
-            take(frame.width * frame.height * _RGB_BYTES if is_picked else 0)
-            if is_picked:
-                if is_damaged:
-                    raise InvalidSampleError.at(f"video: frame {number}", UNDAMAGED, DAMAGED)
-                picked.append(upright(frame))
-    return picked, times_s
-
-
-def _judged(frames: Iterable[Any]) -> Iterator[tuple[Any, bool]]:
-    """Yield from ``judged``; if a frame fails, the error names its number."""
-    num_given = 0
     try:
-        for each in judged(frames):
-            yield each
-            num_given += 1
+        with video.opened() as (container, stream):
+            for number, (frame, is_damaged) in enumerate(judged(container.decode(stream))):
+                time_s = None if frame.pts is None else float(frame.pts * frame.time_base)
+                is_picked = is_wanted(number, time_s)
+                take(frame.width * frame.height * _RGB_BYTES if is_picked else 0)
+                if is_picked:
+                    if is_damaged:
+                        raise InvalidSampleError.at(f"video: frame {number}", UNDAMAGED, DAMAGED)
+                    picked.append(upright(frame))
+                times_s.append(time_s)
     except import_av().FFmpegError as error:
-        raise FrameFileError.of(f"frame {num_given} to be decoded ({DOWNLOAD})", str(error.strerror)) from error
+        raise FrameFileError.of(f"frame {len(times_s)} to be decoded ({DOWNLOAD})", str(error.strerror)) from error
+    return picked, times_s

@@ -8,20 +8,16 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, BinaryIO
-from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.checks import git_lfs_pointer
-from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.frames.pictures import FrameFileError, Picture
+from rfm_client.frames.pictures import FrameFileError
 
 UNDAMAGED = "an undamaged frame"
 DAMAGED = "one that the decoder marks, or is made from such a one"
@@ -33,14 +29,9 @@ _MATRICES = (1, 4, _BT601, 7, _BT2020)  # known to libswscale, which replaces ot
 _SAME_MATRIX = {6: _BT601, 10: _BT2020}  # other numbers for the same matrix
 _BITS = 8  # most bits in a grey video's only channel; depth maps have more
 _TS_SYNC, _TS_PACKETS = 0x47, ((188, 0), (192, 4))  # first byte, its offset by packet length (ISO 13818-1, Blu-ray)
-_PNG, _WEBP, _PICTURE_HEAD_BYTES = b"\x89PNG", b"WEBP", 12  # a WebP file's type name comes last
+_PICTURES = (b"\xff\xd8\xff", b"\x89PNG", b"II*\0", b"MM\0*")  # first bytes: JPEG, PNG, TIFF
+_WEBP = slice(8, 12)  # where a WebP file says so
 _HEAD_BYTES = 1024  # enough to recognise MPEG-TS packets, or a GIF's padding
-_SEVERAL_EPISODES = (
-    "a file in the layout of LeRobot v3.0, which holds several: label the dataset with rfm-client label, or name a "
-    "part: start_s and end_s of load_trajectory, in seconds since the file's first frame (from_timestamp in "
-    "meta/episodes, and length / fps later)"
-)
-_SHARED_FILE = re.compile(r"/videos/[^/]+/chunk-\d+/file-\d+\.\w+$")  # holds several episodes, in LeRobot v3.0
 _NEARLY = math.tan(math.radians(1))  # FFmpeg's tolerance for quarter turns in a display matrix
 
 
@@ -51,14 +42,6 @@ def import_av() -> Any:
     except ImportError as error:
         raise ImportError('video files need PyAV: pip install "./client[video]"') from error
     return av
-
-
-def decoder() -> str:
-    """Return the versions of PyAV and its libraries that determine decoded pixels."""
-    av = import_av()
-    names = ("libswscale", "libavcodec", "libavfilter")
-    libraries = (f"{name} {'.'.join(map(str, av.library_versions[name]))}" for name in names)
-    return f"PyAV {av.__version__}, {', '.join(libraries)}"
 
 
 def video_stream(container: Any) -> Any:
@@ -111,7 +94,7 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
     Raises FrameFileError, also for broken packets, and PyAV's errors. A Matroska or Ogg file that ends too early
     is read as far as possible.
     """
-    _check_ends(file)
+    _check_kind(file)
     times_s: list[float] = []
     count = num_hidden = 0
     with import_av().open(file, format=container) as opened:
@@ -136,10 +119,10 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
     return Packets(count, np.sort(np.array(times_s, np.float64)), num_hidden, tick_s, fps)
 
 
-def _check_ends(file: BinaryIO) -> None:
-    """Raise FrameFileError for Git LFS's pointer to a video, and for a truncated GIF or MPEG-TS file.
+def _check_kind(file: BinaryIO) -> None:
+    """Raise FrameFileError for Git LFS's pointer to a video, for pictures, and for a truncated GIF or MPEG-TS file.
 
-    Decoders for those two may return part of a picture.
+    Releases of PyAV turn pictures in different ways. Decoders for GIF and MPEG-TS may return part of a picture.
     """
     num_bytes = file.seek(0, os.SEEK_END)
     file.seek(max(num_bytes - _HEAD_BYTES, 0))
@@ -149,36 +132,15 @@ def _check_ends(file: BinaryIO) -> None:
     file.seek(0)
     if pointer := git_lfs_pointer(head):
         raise FrameFileError.of("a video file", pointer)
+    if head.startswith(_PICTURES) or head[_WEBP] == b"WEBP":
+        got = "a picture file, or several in one (raw Motion JPEG, animated PNG)"
+        raise FrameFileError.of("a video file (make one of pictures: ffmpeg -i IN OUT.mp4)", got)
     is_cut = head.startswith(b"GIF8") and not tail.rstrip(b"\0").endswith(b";")
     for length, offset in _TS_PACKETS:
         syncs = head[offset::length]
         is_cut |= len(syncs) > 3 and set(syncs) == {_TS_SYNC} and num_bytes % length != 0
     if is_cut:
         raise FrameFileError.of("a whole video file", f"one that ends inside a picture, after {num_bytes} bytes")
-
-
-def check_upright(file: BinaryIO) -> None:
-    """Raise FrameFileError for PNG or WebP pictures with an EXIF orientation.
-
-    PyAV before 17.1 ignores it, and PyAV 19 turns only the first picture in an APNG file.
-    """
-    head = file.read(_PICTURE_HEAD_BYTES)
-    if head.startswith(_PNG) or head.endswith(_WEBP):
-        turn = Picture(head + file.read()).exif_turn
-        if turn is not None:
-            expected = "pictures that are stored upright, or one to a file (PyAV does not turn all of a file)"
-            raise FrameFileError.of(expected, f"EXIF orientation {turn}")
-    file.seek(0)
-
-
-def check_is_one_episode(source: str | Path) -> None:
-    """Raise InvalidSampleError for a path or URL in LeRobot v3.0's layout, where files hold several episodes."""
-    if isinstance(source, Path) or "://" not in source:
-        paths = [Path(source).absolute().as_posix(), Path(source).resolve().as_posix()]  # a download may be a link
-    else:
-        paths = [unquote(urlsplit(source).path)]
-    if any(map(_SHARED_FILE.search, paths)):
-        raise InvalidSampleError.at("video", "a video of one episode", _SEVERAL_EPISODES)
 
 
 class Upright:

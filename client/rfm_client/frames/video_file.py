@@ -6,6 +6,7 @@ Seconds follow the file, whose first frame need not be at 0. T frames, H x W pix
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.frames.pictures import FrameFileError
 from rfm_client.frames.video_decoding import (
@@ -22,14 +24,18 @@ from rfm_client.frames.video_decoding import (
     UNDAMAGED,
     Packets,
     Upright,
-    check_is_one_episode,
-    check_upright,
-    decoder,
     import_av,
     judged,
     read_packets,
     video_stream,
 )
+
+_SEVERAL_EPISODES = (
+    "a file in the layout of LeRobot v3.0, which holds several: label the dataset with rfm-client label, or name a "
+    "part: start_s and end_s of load_trajectory, in seconds since the file's first frame (from_timestamp in "
+    "meta/episodes, and length / fps later)"
+)
+_SHARED_FILE = re.compile(r"/videos/[^/]+/chunk-\d+/file-\d+\.\w+$")  # holds several episodes, in LeRobot v3.0
 
 
 class Video:
@@ -46,29 +52,34 @@ class Video:
     @staticmethod
     def decoder() -> str:
         """Return the versions of PyAV and the libraries that determine the pixels. Raises ImportError."""
-        return decoder()
+        av = import_av()
+        names = ("libswscale", "libavcodec", "libavfilter")
+        libraries = (f"{name} {'.'.join(map(str, av.library_versions[name]))}" for name in names)
+        return f"PyAV {av.__version__}, {', '.join(libraries)}"
 
     def check_is_one_episode(self) -> None:
         """Raise InvalidSampleError for a file in which LeRobot v3.0 keeps several episodes."""
-        check_is_one_episode(self.file)
+        paths = [self.file.absolute().as_posix(), self.file.resolve().as_posix()]  # a download may be a link
+        if any(map(_SHARED_FILE.search, paths)):
+            raise InvalidSampleError.at("video", "a video of one episode", _SEVERAL_EPISODES)
 
     @cached_property
     def packets(self) -> Packets:
         """The packets, read without decoding. Raises FrameFileError for a broken file, or several videos in it."""
-        av = import_av()
         try:
             with self.file.open("rb") as opened:
-                check_upright(opened)
                 return read_packets(opened, self.container)
         except FileNotFoundError as error:
             raise FrameFileError.of("a video file", "none") from error
-        except (av.FFmpegError, OSError) as error:
+        except import_av().InvalidDataError as error:
+            raise FrameFileError.of("a file with a video stream", "a file of another kind, or a damaged one") from error
+        except (import_av().FFmpegError, OSError) as error:
             raise FrameFileError.of("a whole video file", error.strerror or error) from error
 
     @contextmanager
     def opened(self) -> Iterator[tuple[Any, Any]]:
         """Yield the file as opened by PyAV, and its only video stream. Raises FrameFileError and PyAV's errors."""
-        with import_av().open(str(self.file), format=self.container) as container:
+        with import_av().open(str(self.file.absolute()), format=self.container) as container:
             # with PyAV's default threading: thread_type AUTO loses some damage marks
             yield container, video_stream(container)
 

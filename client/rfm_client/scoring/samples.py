@@ -7,10 +7,10 @@ import asyncio
 import itertools
 import logging
 import secrets
-from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from copy import copy
 from functools import partial
-from typing import Any, TypeAlias, TypedDict, TypeVar, cast
+from typing import TypeAlias, TypedDict, cast
 
 from rfm_client.contract import wire
 from rfm_client.contract.description import ModelInfo
@@ -29,7 +29,7 @@ from rfm_client.frames.fit_to_checkpoint import FittedSample, fitted, whole, wit
 from rfm_client.scoring.batching import groups, model_of, padded_bytes, parts
 from rfm_client.transport.calls import Answer
 from rfm_client.transport.limits import ConcurrencyLimiter, Deadline
-from rfm_client.transport.servers import PROBE_TIMEOUT_S, Servers
+from rfm_client.transport.servers import Servers
 from rfm_client.transport.threads import off_loop
 
 _ID_BYTES = 8  # random bytes in a call's request ids
@@ -61,7 +61,7 @@ class CallOptions(TypedDict, total=False):
 
 
 class Call:
-    """Values shared by all requests in one call. Raises ValueError for an invalid request id.
+    """Values shared by all requests in one call. Raises ValueError for an invalid request id, TypeError for others.
 
     outputs: names of outputs to request
     request_ids: yields an id for each request
@@ -72,26 +72,21 @@ class Call:
     server: int | None = None
     checks_blank = True
 
-    def __init__(
-        self,
-        deadline: Deadline,
-        *,
-        logits: bool = False,
-        log_prob: bool = False,
-        all_scores: bool = False,
-        timing: bool = False,
-        subsample: bool = False,
-        resize: bool = False,
-        request_id: str | None = None,
-    ) -> None:
+    def __init__(self, deadline: Deadline, options: CallOptions) -> None:
+        if unknown := options.keys() - CallOptions.__annotations__.keys():
+            raise TypeError(
+                f"expected options among {', '.join(CallOptions.__annotations__)}, got {', '.join(unknown)}"
+            )
+        request_id = options.get("request_id")
         if request_id is not None and not wire.REQUEST_ID.fullmatch(request_id):
             raise InvalidValueError.at("request_id", "1 to 64 letters, digits or any of ._:/+=@-", repr(request_id))
         prefix = request_id or secrets.token_hex(_ID_BYTES)
         self.deadline = deadline
         self.request_ids = (f"{prefix}-{number}" for number in itertools.count(1))
-        options = {wire.PROGRESS_LOGITS: logits, "log_prob": log_prob, wire.TIMING_MS: timing}
-        self.outputs = tuple(name for name, is_asked in options.items() if is_asked)
-        self.all_scores, self.subsample, self.resize = all_scores, subsample, resize
+        outputs = {wire.PROGRESS_LOGITS: "logits", "log_prob": "log_prob", wire.TIMING_MS: "timing"}
+        self.outputs = tuple(output for output, option in outputs.items() if options.get(option))
+        self.all_scores = options.get("all_scores", False)
+        self.subsample, self.resize = options.get("subsample", False), options.get("resize", False)
 
     def at(self, server: int) -> Call:
         """Return a copy of the call that asks this server first."""
@@ -100,7 +95,6 @@ class Call:
         return call
 
 
-Answered = TypeVar("Answered")
 Outcome: TypeAlias = Result | RewardError
 
 logger = logging.getLogger("rfm_client")
@@ -120,16 +114,9 @@ class SampleScorer:
         self._servers = servers
         self._concurrency = concurrency
         self._infos: dict[str, ModelInfo] = {}  # until another model version answers
+        self._undescribed: set[str] = set()  # not asked about embeddings again, which they score without a description
         self._checks_lengths = True  # until a trajectory was too long
         self._checks_blank = True  # until a video was blank
-        self._asking = asyncio.Lock()
-
-    async def result(self, sample: Sample, call: Call) -> Result:
-        """Return the result of one sample. Raises RewardError."""
-        fit = await self._fitted(sample, call)
-        (result,) = results_of(list(await self._request(model_of(fit.sample, self._model), [fit.sample], call)))
-        await self._check_lengths([fit.sample], call.deadline)
-        return with_frame_indices(result, fit.frame_indices)
 
     async def outcomes(self, samples: Sequence[Sample], call: Call) -> list[Outcome]:
         """Return a result or error for each sample. Errors carry no traceback, which would keep arrays alive."""
@@ -141,12 +128,13 @@ class SampleScorer:
             except RewardError as error:
                 outcomes[index] = error.with_traceback(None)
         sent = {index: fit.sample for index, fit in fits.items()}
-        scored = await _together([self._scored(*group, sent, call) for group in groups(sent, self._model)])
+        calls = [self._scored(*group, sent, call) for group in groups(sent, self._model)]
+        scored = [await calls[0]] if len(calls) == 1 else await asyncio.gather(*calls)  # one needs no task
         for index, outcome in itertools.chain(*scored):
             indices = fits[index].frame_indices
             outcomes[index] = outcome if isinstance(outcome, RewardError) else with_frame_indices(outcome, indices)
         answered = [sample for index, sample in sent.items() if not isinstance(outcomes[index], RewardError)]
-        await self._check_lengths(answered, call.deadline)
+        self._check_lengths(answered)
         return [outcomes[index] for index in range(len(samples))]
 
     async def embeddings(self, trajectory: Trajectory, call: Call) -> Trajectory:
@@ -186,25 +174,12 @@ class SampleScorer:
             expected = "frames: expected pictures that show something, got %d frames: %s (logged once)"
             logger.warning(expected, len(frames), BlankFrames(frames).told)
 
-    async def _check_lengths(self, samples: Sequence[Sample], deadline: Deadline) -> None:
-        """Warn about samples that are too long. An unknown limit costs one query to the server."""
-        lengths: dict[str, int] = {}
+    def _check_lengths(self, samples: Iterable[Sample]) -> None:
+        """Log the first sample that is too long, if its model is described."""
         for sample in samples if self._checks_lengths else ():
-            model = model_of(sample, self._model)
-            lengths[model] = max(lengths.get(model, 1), _longest(sample))
-        for model, num_frames in lengths.items():
-            info = None if num_frames == 1 else self._infos.get(model) or await self._limits(model, deadline)
+            info = self._infos.get(model_of(sample, self._model))
             if info is not None:
-                self.tell_of_length(num_frames, info)
-
-    async def _limits(self, model: str, deadline: Deadline) -> ModelInfo | None:
-        """Return the model's description; None on failure: with the answer already here, the call must not fail."""
-        async with self._asking:
-            try:
-                return await self.model_info(model, Deadline(min(PROBE_TIMEOUT_S, deadline.remaining_s())))
-            except RewardError:
-                self._checks_lengths = False  # otherwise every call would ask again
-                return None
+                self.tell_of_length(_longest(sample), info)
 
     async def _fitted(self, sample: Sample, call: Call) -> FittedSample:
         """Return the sample as the call sends it. Raises RewardError."""
@@ -231,7 +206,7 @@ class SampleScorer:
         except RewardError as error:
             return zip(group, for_each(error, len(group)), strict=True)
         requests = [[samples[index] for index in part] for part in parts(samples, group, limit)]
-        answered = await _together([self._request(model, request, call) for request in requests])
+        answered = await asyncio.gather(*(self._request(model, request, call) for request in requests))
         return zip(group, itertools.chain(*answered), strict=True)
 
     async def _request(
@@ -264,12 +239,16 @@ class SampleScorer:
 
     async def _given(self, model: str, samples: Sequence[Sample], call: Call) -> tuple[str, ...]:
         """Return the names of all scores in the model's description. Raises RewardError."""
-        if samples[0].trajectories[0].frames is None and not call.all_scores:
-            return ()  # the description would cost a request, and embedding models give no more unasked
+        is_needed = call.all_scores or samples[0].trajectories[0].frames is not None
+        if not is_needed and model in self._undescribed:
+            return ()
         try:
             return (await self.model_info(model, call.deadline)).scores
-        except (ModelNotFoundError, InferenceFailedError):  # the request itself decides
-            return ()
+        except RewardError as error:
+            if is_needed and not isinstance(error, (ModelNotFoundError, InferenceFailedError)):
+                raise
+            self._undescribed.add(model)
+            return ()  # the request itself decides
 
     async def infer(
         self,
@@ -285,11 +264,15 @@ class SampleScorer:
         tensors: makes the inputs, ``num_bytes`` large, when it is the request's turn
         """
         # Make tensors only in turn, so that they do not pile up.
-        async with self._concurrency.room(num_bytes, call.deadline):
-            inputs = await off_loop(num_bytes, tensors)
-            answer = await self._servers.infer(
-                model, inputs, outputs, call.deadline, request_id=request_id, first=call.server
-            )
+        try:
+            async with self._concurrency.room(num_bytes, call.deadline):
+                inputs = await off_loop(num_bytes, tensors)
+                answer = await self._servers.infer(
+                    model, inputs, outputs, call.deadline, request_id=request_id, first=call.server
+                )
+        except RewardError as error:
+            error.request_id = request_id
+            raise
         known = self._infos.get(model)
         if known is not None and known.versions and answer.model_version not in known.versions:
             del self._infos[model]
@@ -301,11 +284,6 @@ def _longest(sample: Sample) -> int:
     if isinstance(sample, ProgressSample) and sample.frame_steps:
         return 0
     return max(trajectory.num_frames for trajectory in sample.trajectories)
-
-
-async def _together(calls: Sequence[Coroutine[Any, Any, Answered]]) -> Sequence[Answered]:
-    """Await all coroutines. A single coroutine, as in most calls, needs no separate task."""
-    return [await calls[0]] if len(calls) == 1 else await asyncio.gather(*calls)
 
 
 def results_of(outcomes: list[Outcome], where: str = "") -> list[Result]:

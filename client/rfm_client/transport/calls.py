@@ -5,22 +5,25 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import os
-from collections.abc import Awaitable, Callable, Collection, Mapping
-from contextlib import nullcontext, suppress
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
+from contextlib import asynccontextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from importlib import import_module
 from typing import Any, ClassVar, Protocol, TypeVar
 
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 from rfm_client.contract import errors, triton
-from rfm_client.contract.addresses import grpc_proxy, split_url
+from rfm_client.contract.addresses import split_url
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.wire import Tensors
-from rfm_client.transport.connection import SECURE_SCHEMES, Connection, Credentials, grpc_options
+from rfm_client.transport.connection import SECURE_SCHEMES, SILENT_S, Credentials, grpc_options
 from rfm_client.transport.limits import check_size, timeout
 from rfm_client.transport.shared_memory import Region, SharedMemory
 from rfm_client.transport.threads import off_loop
@@ -61,93 +64,88 @@ class Transport(Protocol):
         """Close the connection to the server."""
 
 
-def connect(url: str, *, shared_memory: bool = False, credentials: Credentials | None = None) -> TritonTransport:
-    """Return the transport for ``grpc://host:port`` or ``http://host:port``, with TLS ``grpcs://`` or ``https://``.
+class TritonTransport:
+    """The transport for ``grpc://host:port`` or ``http://host:port``, with TLS ``grpcs://`` or ``https://``.
 
-    The transport connects at first use. Raises ValueError.
+    tritonclient is imported, and its client connects, at first use; the client belongs to the event loop that runs
+    then. Over gRPC a late or cancelled call is also cancelled on the server, unless scoring has begun; if the host name
+    has several addresses (a headless Service), gRPC spreads the requests over them. Over HTTP there is one connection
+    per concurrent call, and Triton finishes a request even if its caller has left. Raises ValueError.
 
     shared_memory: True: send large inputs through memory that the server, on the same host, also maps
     """
-    kind = GrpcTransport if split_url(url)[0].startswith("grpc") else HttpTransport
-    return kind(url, credentials or Credentials(), shared_memory=shared_memory)
 
+    _first_process: ClassVar[int | None] = None  # the first process that used gRPC
 
-class TritonTransport:
-    """Base class for gRPC and HTTP, whose asyncio clients differ only in a few options.
-
-    tritonclient's module is imported at first use. The client belongs to the event loop that runs then.
-    """
-
-    _module: ClassVar[str]  # tritonclient's module with InferInput and InferRequestedOutput
-    as_json: ClassVar[dict[str, bool]] = {}  # makes the client's methods return dictionaries
-    _proxy: str | None = None  # for errors
-
-    def __init__(self, url: str, credentials: Credentials, *, shared_memory: bool) -> None:
+    def __init__(self, url: str, credentials: Credentials | None = None, *, shared_memory: bool = False) -> None:
         self.url = url
         self._scheme, self._address = split_url(url)
-        self._credentials = credentials
-        if credentials.uses_tls and self._scheme not in SECURE_SCHEMES:
+        self._is_grpc = self._scheme.startswith("grpc")
+        self.as_json = {"as_json": True} if self._is_grpc else {}  # makes the client's methods return dictionaries
+        self._credentials = credentials or Credentials()
+        if self._credentials.uses_tls and self._scheme not in SECURE_SCHEMES:
             raise InvalidValueError.at("url", "grpcs:// or https:// with certificates", url)
         self._shared_memory = SharedMemory(url) if shared_memory else None
-        self._connection: Connection | None = None
-        self._left: list[Connection] = []  # may not be closed yet
+        self._client: Any = None  # tritonclient's, for the next call
+        self._calls: Counter[Any] = Counter()  # by client; an earlier client closes after its last call
+        self._silent_since_s: dict[Any, float] = {}  # by client: its first call since the last answer
+        self._is_triton = self._is_grpc  # False: may be the metrics port
 
     @cached_property
     def _triton(self) -> Any:
-        return import_module(self._module)
+        return import_module("tritonclient.grpc.aio" if self._is_grpc else "tritonclient.http")
 
     async def infer(
         self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
     ) -> Answer:
-        request = partial(self._infer, model, inputs, outputs, request_id, timeout_s)
-        return await self._call(model, request, timeout_s)
+        requested = [self._triton.InferRequestedOutput(name) for name in outputs]
+        # If the export sets queue_timeout_ms, Triton drops requests that wait longer in its queue, over HTTP too.
+        waits_us = max(int(timeout_s * _US_PER_S), 1)
+        largest = max(inputs, key=lambda name: inputs[name].nbytes)
+
+        async def request(client: Any) -> Answer:
+            lent = nullcontext() if self._shared_memory is None else self._shared_memory.lend(client, inputs[largest])
+            async with lent as region:
+                regions = {largest: region} if region is not None else {}
+                check_size(inputs, regions)
+                num_bytes = 0 if regions else inputs[largest].nbytes
+                tensors = await off_loop(num_bytes, self._inputs, inputs, regions)
+                answer = await client.infer(model, tensors, outputs=requested, request_id=request_id, timeout=waits_us)
+            response = answer.get_response()
+            version = response["model_version"] if isinstance(response, dict) else response.model_version
+            return Answer(_outputs(answer, outputs), str(version))
+
+        return await self.call(request, timeout_s, model=model)
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
         async def request(client: Any) -> ModelInfo:
             config = await client.get_model_config(model, **self.as_json)
             return ModelInfo.from_config(config.get("config", config))  # nested in gRPC's answer
 
-        return await self._call(model, request, timeout_s, bad_request=errors.ModelNotFoundError)
+        return await self.call(request, timeout_s, model=model, bad_request=errors.ModelNotFoundError)
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
         async def request(client: Any) -> bool:
-            return bool(await client.is_server_ready() and await client.is_model_ready(model))
+            is_ready = bool(await client.is_server_ready() and await client.is_model_ready(model))
+            if is_ready and not self._is_triton:  # Triton's metrics port says over HTTP that everything is ready
+                with suppress(InferenceServerException, errors.InferenceFailedError):  # it refuses nothing
+                    await client.get_server_metadata()
+                self._is_triton = True
+            return is_ready
 
         try:
-            return await self._call(model, request, timeout_s)
+            return await self.call(request, timeout_s)
         except errors.ServerError:
             return False
-
-    async def ask(self, request: Callable[[Any], Awaitable[Answered]], timeout_s: float) -> Answered:
-        """Return what ``request`` gets from tritonclient's client. Raises RewardError."""
-        return await self._call("", request, timeout_s)
 
     async def close(self) -> None:
         try:
             if self._shared_memory is not None:
-                with self._connected().used() as client:
+                async with self._connected() as client:
                     await self._shared_memory.close(client)
         finally:
-            for connection in (*self._left, *filter(None, [self._connection])):
-                await connection.close()
-
-    async def _infer(
-        self, model: str, inputs: Tensors, outputs: Collection[str], request_id: str, timeout_s: float, client: Any
-    ) -> Answer:
-        requested = [self._triton.InferRequestedOutput(name) for name in outputs]
-        # If the export sets queue_timeout_ms, Triton drops requests that wait longer in its queue, over HTTP too.
-        waits_us = max(int(timeout_s * _US_PER_S), 1)
-        largest = max(inputs, key=lambda name: inputs[name].nbytes)
-        lent = nullcontext() if self._shared_memory is None else self._shared_memory.lend(client, inputs[largest])
-        async with lent as region:
-            regions = {largest: region} if region is not None else {}
-            check_size(inputs, regions)
-            num_bytes = 0 if regions else inputs[largest].nbytes
-            tensors = await off_loop(num_bytes, self._inputs, inputs, regions)
-            answer = await client.infer(model, tensors, outputs=requested, request_id=request_id, timeout=waits_us)
-        response = answer.get_response()
-        version = response["model_version"] if isinstance(response, dict) else response.model_version
-        return Answer(_outputs(answer, outputs), str(version))
+            for client in [*self._calls]:
+                await client.close()
 
     def _inputs(self, inputs: Tensors, regions: Mapping[str, Region]) -> list[Any]:
         tensors = []
@@ -160,23 +158,27 @@ class TritonTransport:
             tensors.append(tensor)
         return tensors
 
-    async def _call(
+    async def call(
         self,
-        model: str,
         request: Callable[[Any], Awaitable[Answered]],
         timeout_s: float,
         *,
+        model: str = "",
         bad_request: triton.BadRequest = triton.invalid_sample,
     ) -> Answered:
-        """Return the answer to ``request`` within ``timeout_s``; ``bad_request`` as in ``triton.error_from``."""
+        """Return what ``request`` gets from tritonclient's client. Raises RewardError.
+
+        model: named in the error for a missing model
+        bad_request: as in ``triton.error_from``
+        """
         try:
             # One limit for gRPC and HTTP. Triton drops a cancelled gRPC call, unless scoring has begun.
-            async with timeout(timeout_s):
-                return await self._answer(request)
+            async with timeout(timeout_s), self._connected() as client:
+                return await request(client)
         except errors.RewardError:
             raise
         except Exception as raised:
-            error = triton.error_from(raised, self.url, proxy=self._proxy, bad_request=bad_request)
+            error = triton.error_from(raised, self.url, bad_request)
             if error is None:
                 raise
             if isinstance(error, errors.ModelNotFoundError):
@@ -186,58 +188,44 @@ class TritonTransport:
     async def _not_served(self, model: str, error: errors.ModelNotFoundError) -> errors.ModelNotFoundError:
         """Return the error with the served models' names, if the server lists them in time."""
         with suppress(Exception):
-            async with timeout(_SERVED_TIMEOUT_S):
-                with self._connected().used() as client:
-                    statistics = await client.get_inference_statistics(**self.as_json)
-                    served = {each["name"] for each in statistics.get("model_stats", [])}
-                    return triton.not_served(model, error.message, served)
+            async with timeout(_SERVED_TIMEOUT_S), self._connected() as client:
+                statistics = await client.get_inference_statistics(**self.as_json)
+                served = {each["name"] for each in statistics.get("model_stats", [])}
+                return triton.not_served(model, error.message, served)
         return error
 
-    async def _answer(self, request: Callable[[Any], Awaitable[Answered]]) -> Answered:
-        """Return the answer. If the call is cancelled on a silent connection, later calls get a new connection."""
-        connection = self._connected()
+    @asynccontextmanager
+    async def _connected(self) -> AsyncIterator[Any]:
+        """Lend the client to a call. If the call is cancelled on a silent connection, later calls get a new one."""
+        client = self._client = self._client or self._open()
+        self._calls[client] += 1
+        self._silent_since_s.setdefault(client, time.monotonic())
         try:
-            with connection.used() as client:
-                answer = await request(client)
-            connection.record_answer()
-            return answer
-        except InferenceServerException:
-            connection.record_answer()  # or gRPC has noticed that the connection ended
+            yield client
+            self._silent_since_s.pop(client, None)
+        except InferenceServerException:  # an answer, or gRPC has noticed that the connection ended
+            self._silent_since_s.pop(client, None)
             raise
         except asyncio.CancelledError:
-            if connection.is_silent and connection is self._connection:
+            silent_s = time.monotonic() - self._silent_since_s.get(client, math.inf)
+            if client is self._client and silent_s >= SILENT_S:
                 logger.info("%s: nothing comes over the connection: the next call gets a new one", self.url)
-                self._connection = None
-                self._left = [*(left for left in self._left if not left.is_closed), connection]
-                connection.leave()
+                self._client = None
             raise
-
-    def _connected(self) -> Connection:
-        if self._connection is None:
-            self._connection = Connection(self._open())
-        return self._connection
+        finally:
+            self._calls[client] -= 1
+            if client is not self._client and not self._calls[client]:
+                await client.close()
+                del self._calls[client]
+                self._silent_since_s.pop(client, None)
 
     def _open(self) -> Any:
         """Return a client with tritonclient's methods. It connects at first use and sends the credentials."""
-        raise NotImplementedError
+        if not self._is_grpc:
+            from rfm_client.transport.http import HttpClient
 
-
-class GrpcTransport(TritonTransport):
-    """gRPC transport: a late or cancelled call is also cancelled on the server, unless scoring has begun.
-
-    If the host name has several addresses (a headless Service), gRPC spreads the requests over them.
-    """
-
-    _module = "tritonclient.grpc.aio"
-    as_json: ClassVar[dict[str, bool]] = {"as_json": True}
-    _first_process: int | None = None  # the first process that used gRPC
-
-    def __init__(self, url: str, credentials: Credentials, *, shared_memory: bool) -> None:
-        super().__init__(url, credentials, shared_memory=shared_memory)
-        self._proxy = grpc_proxy(self._address)
-
-    def _open(self) -> Any:
-        process = GrpcTransport._first_process = GrpcTransport._first_process or os.getpid()
+            return HttpClient(self._scheme, self._address, self._credentials)
+        process = TritonTransport._first_process = TritonTransport._first_process or os.getpid()
         if process != os.getpid():  # gRPC would crash or hang
             raise RuntimeError(
                 f"gRPC was used in process {process}, which forked this one: "
@@ -248,17 +236,6 @@ class GrpcTransport(TritonTransport):
         )
         self._credentials.show_with_each_request(client)
         return client
-
-
-class HttpTransport(TritonTransport):
-    """HTTP transport: one connection per concurrent call. Triton finishes a request even if its caller has left."""
-
-    _module = "tritonclient.http"
-
-    def _open(self) -> Any:
-        from rfm_client.transport.http import HttpClient
-
-        return HttpClient(self._scheme, self._address, self._credentials)
 
 
 def _outputs(answer: Any, names: Collection[str]) -> Tensors:

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""A connection to a server: its options and credentials, and a diagnosis for wrong ports.
+"""Options and credentials of a connection.
 
 A firewall or a lost machine drops packets without an error. Over gRPC all calls share one connection, so every call
 would run into its deadline. Two rules open a new connection instead:
 
-- A request whose bytes the peer does not acknowledge within UNACKNOWLEDGED_MS ends the connection. The kernel enforces
-  this (TCP_USER_TIMEOUT, which gRPC sets where keepalive is on). The call is sent again over a new connection.
-- If a call runs into its deadline and nothing has arrived on the connection for SILENT_S, later calls get a new
-  connection. This covers peers that acknowledge bytes but do not answer, such as a proxy that hangs.
+- A request whose bytes the peer does not acknowledge within UNACKNOWLEDGED_MS ends the connection, and is sent again.
+  The kernel enforces this (TCP_USER_TIMEOUT, which gRPC sets where keepalive is on).
+- If a call runs into its deadline and nothing has arrived for SILENT_S, later calls get a new connection. This covers
+  peers that acknowledge bytes but do not answer, such as a proxy that hangs.
 
 Pings alone do not suffice. Triton closes a connection after more than two pings less than 300 s apart during which it
 sends nothing, as in a long call. So gRPC pings at most every PING_MS, and only during a call.
@@ -15,21 +15,15 @@ sends nothing, as in a long call. So gRPC pings at most every PING_MS, and only 
 
 from __future__ import annotations
 
-import asyncio
-import http.client
 import re
-import socket
 import ssl
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from rfm_client.contract import errors
-from rfm_client.contract.addresses import check_authorities, grpc_proxy, host_of, in_url, load_certificate, split_url
+from rfm_client.contract.addresses import check_authorities, host_of, is_loopback, load_certificate
 from rfm_client.contract.settings import ConfigError
 
 PING_MS = 330_000
@@ -51,60 +45,8 @@ GRPC_OPTIONS: dict[str, int | str] = {
 
 def grpc_options(address: str) -> list[tuple[str, int | str]]:
     """Return the options for a gRPC channel to ``host:port``."""
-    options = GRPC_OPTIONS if grpc_proxy(address) else {**GRPC_OPTIONS, "grpc.enable_http_proxy": 0}
+    options = {**GRPC_OPTIONS, "grpc.enable_http_proxy": int(not is_loopback(host_of(address)))}
     return list(options.items())
-
-
-class Connection:
-    """A tritonclient asyncio client, for one event loop. Once left, it closes after its last call."""
-
-    def __init__(self, client: Any) -> None:
-        self._client = client
-        self._num_calls = 0
-        self._is_left = False
-        self._silent_since_s: float | None = None  # first call since the last answer
-        self._closing: asyncio.Task[None] | None = None
-
-    @contextmanager
-    def used(self) -> Iterator[Any]:
-        """Context manager in which a call uses the client."""
-        self._num_calls += 1
-        if self._silent_since_s is None:
-            self._silent_since_s = time.monotonic()
-        try:
-            yield self._client
-        finally:
-            self._num_calls -= 1
-            self._close_if_unused()
-
-    def record_answer(self) -> None:
-        """Record that the server has just sent something."""
-        self._silent_since_s = None
-
-    @property
-    def is_silent(self) -> bool:
-        """True if nothing has arrived for SILENT_S since a call began."""
-        return self._silent_since_s is not None and time.monotonic() - self._silent_since_s >= SILENT_S
-
-    def leave(self) -> None:
-        """Close the connection after its last call; no new call may use it."""
-        self._is_left = True
-        self._close_if_unused()
-
-    @property
-    def is_closed(self) -> bool:
-        """True once ``close`` has finished."""
-        return self._closing is not None and self._closing.done()
-
-    async def close(self) -> None:
-        """Close the connection, even if calls still use it."""
-        if self._closing is None:
-            self._closing = asyncio.create_task(self._client.close())
-        await self._closing
-
-    def _close_if_unused(self) -> None:
-        if self._is_left and not self._num_calls and self._closing is None:
-            self._closing = asyncio.create_task(self._client.close())
 
 
 SECURE_SCHEMES = ("grpcs", "https")
@@ -192,80 +134,3 @@ class Credentials:
             request.headers = {**request.headers, **shown}
 
         client.register_plugin(show)
-
-
-LOOK_S = 1.0
-_READ_BYTES = 4096
-_HTTP2_FRAME = "\x00\x00"  # a gRPC server's answer to HTTP/1.1 starts with this
-
-
-_GRPC, _HTTP, _METRICS, _GATEWAY = "its gRPC port", "its HTTP port", "its metrics port", "a gateway's"
-_EXPECTED = {"grpc": (_GRPC, "Triton's gRPC port", 8001), "http": (_HTTP, "Triton's HTTP port", 8000)}
-WRONG_PORT_ERRORS = (  # errors that a wrong port may cause
-    errors.ServerUnavailableError,
-    errors.AccessDeniedError,
-    errors.InferenceFailedError,
-    errors.ModelNotFoundError,  # from a gateway
-)
-
-
-def wrong_port(url: str) -> str | None:
-    """Say what is wrong with the port in a server's URL and how to fix it; None: no fault found."""
-    scheme, address = split_url(url)
-    protocol = scheme.removesuffix("s")
-    right, expected, usual = _EXPECTED[protocol]
-    if scheme != protocol and _speaks_tls(address):
-        return None
-    found = _port_at(address)
-    if found is None:
-        is_secure = scheme == protocol and _speaks_tls(address)
-        return f"{url}: expected {expected} without TLS, got TLS: use {protocol}s://{address}" if is_secure else None
-    if found is right and scheme == protocol:
-        return None
-    mend = {
-        _GRPC: f"use grpc://{address}",
-        _HTTP: f"use http://{address}",
-        _METRICS: f"use {scheme}://{in_url(host_of(address))}:{usual}, unless the server was given another",
-        _GATEWAY: f"use that of the Triton behind it, by default {usual}",
-    }[found]
-    with_tls, without = ("", "") if scheme == protocol else (" with TLS", " without")
-    return f"{url}: expected {expected}{with_tls}, got {found}{without}: {mend}"
-
-
-def _port_at(address: str) -> str | None:
-    """Return the kind of port, for a message; None: unknown."""
-    try:
-        if _read(address, "/v2").startswith(b"{"):
-            return _HTTP
-        metrics = _read(address, "/metrics")
-        if b"rfm_gateway_" in metrics or b'"available_gpus"' in _read(address, "/health"):
-            return _GATEWAY
-        return _METRICS if b"nv_" in metrics else None
-    except http.client.BadStatusLine as error:
-        return _GRPC if str(error).startswith(_HTTP2_FRAME) else None
-    except (OSError, http.client.HTTPException):
-        return None
-
-
-def _speaks_tls(address: str) -> bool:
-    context = ssl.create_default_context()
-    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    try:
-        place = host_of(address), int(address.rpartition(":")[2])
-        with socket.create_connection(place, LOOK_S) as plain, context.wrap_socket(plain):
-            return True
-    except ssl.SSLError as error:
-        return "ALERT" in (error.reason or "")  # refuses the handshake, but speaks TLS
-    except (OSError, UnicodeError):
-        return False
-
-
-def _read(address: str, path: str) -> bytes:
-    """Return the beginning of a page; empty if the page is missing."""
-    connection = http.client.HTTPConnection(address, timeout=LOOK_S)
-    try:
-        connection.request("GET", path)
-        answer = connection.getresponse()
-        return answer.read(_READ_BYTES) if answer.status == http.client.OK else b""
-    finally:
-        connection.close()

@@ -8,14 +8,16 @@ import json
 from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
+from urllib.parse import urljoin
 
 from tritonclient.http.aio import InferenceServerClient
 from tritonclient.utils import InferenceServerException
 
-from rfm_client.contract import triton
+from rfm_client.contract.errors import InferenceFailedError
 from rfm_client.transport.connection import SECURE_SCHEMES, Credentials
 from rfm_client.transport.threads import MIN_BYTES
 
+_REDIRECTS = range(300, 400)
 _AS_IT_IS = {"Accept-Encoding": "identity"}  # otherwise aiohttp asks for gzip, which hardly shrinks floats
 
 
@@ -44,25 +46,34 @@ class HttpClient(InferenceServerClient):  # type: ignore[misc]  # untyped
     async def _ask(self, method: str, path: str, body: bytes, headers: Mapping[str, Any] | None) -> Any:
         """Return aiohttp's answer, with its content read.
 
-        Raises InferenceFailedError for a redirect, InferenceServerException for an error other than unreadiness.
+        Raises InferenceFailedError for a redirect and for another server than Triton, InferenceServerException for an
+        error other than unreadiness.
         """
         # aiohttp sends a stream piece by piece. Large bytes would block the event loop, and aiohttp warns about them.
         data = io.BytesIO(body) if len(body) >= MIN_BYTES else body or None
         every = {**self._own_headers, **self._fix_header(headers or {})}
         url = f"{self._url}/{path}"
         answer = await self._stub.request(method, url, data=data, headers=every, allow_redirects=False)
-        if triton.is_redirect(answer.status):
+        if answer.status in _REDIRECTS:
             answer.release()
-            raise triton.redirected(self._url, answer.headers.get("Location", ""))
+            target = urljoin(url, answer.headers.get("Location", ""))
+            raise InferenceFailedError(
+                f"{self._url}: expected an answer of Triton, got a redirect to {target!r:.200}: give that server's "
+                "address as URL if you trust it"
+            )
         content = await answer.read()  # which frees the connection
         if answer.status != HTTPStatus.OK and not path.endswith("/ready"):
-            raise InferenceServerException(_reason(content), status=str(answer.status))
+            raise _error(self._url, answer.status, content)
         return answer
 
 
-def _reason(content: bytes) -> str:
-    """Return Triton's reason for an error; otherwise the answer's text, which may be a proxy's."""
+def _error(url: str, status: int, content: bytes) -> Any:
+    """Return the error with Triton's reason; otherwise with the answer's text, which may be a proxy's."""
     try:
-        return str(json.loads(content)["error"])
+        reason = str(json.loads(content)["error"])
     except (ValueError, LookupError, TypeError):
-        return content.decode(errors="replace") or "the answer is empty"
+        if status == HTTPStatus.NOT_FOUND:
+            expected = "Triton's HTTP port (by default 8000)"
+            return InferenceFailedError(f"{url}: expected {expected}, got a server without Triton's pages (404)")
+        reason = content.decode(errors="replace") or "the answer is empty"
+    return InferenceServerException(reason, status=str(status))

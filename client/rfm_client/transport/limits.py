@@ -9,8 +9,6 @@ import time
 from collections.abc import AsyncIterator, Collection
 from contextlib import asynccontextmanager
 
-import numpy as np
-
 if sys.version_info >= (3, 11):
     from asyncio import timeout as timeout
 else:
@@ -41,6 +39,11 @@ class Deadline:
         self.timeout_s = timeout_s
         self.at_s = time.monotonic() + timeout_s
 
+    @property
+    def passed_s(self) -> float:
+        """The seconds since the call began."""
+        return time.monotonic() - (self.at_s - self.timeout_s)
+
     def ends_within(self, seconds: float) -> bool:
         """True if at most ``seconds`` are left."""
         return time.monotonic() + seconds >= self.at_s
@@ -62,7 +65,11 @@ def check_size(inputs: Tensors, shared: Collection[str]) -> None:
 
     shared: names of inputs in shared memory
     """
-    sizes = {name: _num_bytes(inputs, name) for name in inputs if name not in shared}
+    sizes = {
+        name: sum(len(text) + _LENGTH_BYTES for text in array.flat) if array.dtype == object else array.nbytes
+        for name, array in inputs.items()
+        if name not in shared
+    }
     if sum(sizes.values()) <= MAX_REQUEST_BYTES:
         return
     raise InvalidSampleError.at(
@@ -72,13 +79,6 @@ def check_size(inputs: Tensors, shared: Collection[str]) -> None:
         "shrink the frames (resize, --resize), score fewer (subsample, or --fps for videos), or share memory with a "
         "server on this host (shared_memory)",
     )
-
-
-def _num_bytes(inputs: Tensors, name: str) -> int:
-    array = inputs[name]
-    if array.dtype != np.object_:
-        return array.nbytes
-    return sum(len(text) + _LENGTH_BYTES for text in array.ravel())
 
 
 class ConcurrencyLimiter:

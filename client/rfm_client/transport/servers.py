@@ -22,6 +22,7 @@ import time
 from collections.abc import Awaitable, Callable, Collection, Sequence
 from typing import TypeVar
 
+from rfm_client.contract.addresses import with_proxy
 from rfm_client.contract.checks import require
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import (
@@ -36,8 +37,7 @@ from rfm_client.contract.errors import (
     clear_variables,
 )
 from rfm_client.contract.wire import Tensors
-from rfm_client.transport.calls import Answer, Transport, TritonTransport
-from rfm_client.transport.connection import WRONG_PORT_ERRORS, wrong_port
+from rfm_client.transport.calls import Answer, Transport
 from rfm_client.transport.limits import Deadline
 
 Answered = TypeVar("Answered")
@@ -58,7 +58,6 @@ class KnownServer:
     """One of several servers: transport, load and failures.
 
     failures: how often the server was left out since the last success
-    has_answered: True after the first success
     comeback: ends when the server reports ready again; None: never left out
     """
 
@@ -67,7 +66,6 @@ class KnownServer:
         self.outstanding = 0
         self.last_request = 0
         self.failures = 0
-        self.has_answered = False
         self.comeback: asyncio.Task[None] | None = None
 
     @property
@@ -84,26 +82,16 @@ class KnownServer:
         finally:
             self.outstanding -= 1
 
-    async def rested(self, model: str) -> None:
-        """Pause, longer after each failure, then wait until the server reports ready."""
-        await asyncio.sleep(pause_s(self.failures - 1, LONGEST_REST_S))
+    async def back(self, model: str, rest_s: float, restart_s: float) -> None:
+        """Wait for ``rest_s``, then until the server is ready: after ``restart_s``, or after it reported not ready."""
+        await asyncio.sleep(rest_s)
+        until_s = time.monotonic() + restart_s
         for attempt in itertools.count():
-            if await self.transport.is_ready(model, PROBE_TIMEOUT_S):
-                return
-            await asyncio.sleep(pause_s(attempt, LONGEST_PAUSE_S))
-
-    async def back(self, model: str, *, was_down: bool) -> None:
-        """Wait until the server is ready again after a process or the connection ended.
-
-        Triton 2.51 reports a dead model as ready. So wait for RESTART_S, or until the server has reported not ready.
-        """
-        until_s = time.monotonic() + RESTART_S
-        while True:
             is_ready = await self.transport.is_ready(model, PROBE_TIMEOUT_S)
-            if is_ready and (was_down or time.monotonic() >= until_s):
+            if is_ready and time.monotonic() >= until_s:
                 return
-            was_down = was_down or not is_ready
-            await asyncio.sleep(_POLL_S)
+            until_s = until_s if is_ready else 0.0
+            await asyncio.sleep(pause_s(attempt, LONGEST_PAUSE_S if rest_s else _POLL_S))
 
     async def close(self) -> None:
         """Close the connection, even if calls still use it."""
@@ -138,7 +126,7 @@ class Servers:
         request_id: str,
         first: int | None = None,
     ) -> Answer:
-        """Return the named ``outputs`` that ``model`` gives for ``inputs``. Raises RewardError with the request id.
+        """Return the named ``outputs`` that ``model`` gives for ``inputs``. Raises RewardError.
 
         first: index of the server to ask; after a failure, the next in the list. None: the least busy
         """
@@ -146,11 +134,7 @@ class Servers:
         def request(server: Transport, left_s: float) -> Awaitable[Answer]:
             return server.infer(model, inputs, outputs, left_s, request_id=request_id)
 
-        try:
-            return await self._request(model, request, deadline, first)
-        except RewardError as error:
-            error.request_id = request_id
-            raise
+        return await self._request(model, request, deadline, first)
 
     async def model_info(self, model: str, deadline: Deadline) -> ModelInfo:
         """Return a server's description of ``model``. Raises RewardError."""
@@ -189,12 +173,6 @@ class Servers:
             for probe in probes:
                 probe.cancel()
 
-    async def check_ports(self) -> None:
-        """Raise ServerUnavailableError if all URLs have a wrong port: waiting would not help."""
-        named = await self._wrong_ports()
-        if named and named[0] is not None and all(named):
-            raise ServerUnavailableError(named[0])
-
     def stop_retrying(self) -> None:
         """Let later failures end their calls at once, without a message in the log."""
         self._retry = False
@@ -216,9 +194,6 @@ class Servers:
             clear_variables(error)
             if self._is_closed and not _is_task_cancelled():  # closing connections raise errors from many classes
                 raise ClientClosedError("this client was closed during the call") from error
-            if isinstance(error, WRONG_PORT_ERRORS) and not any(server.has_answered for server in self._servers):
-                for named in filter(None, await self._wrong_ports()):
-                    raise ServerUnavailableError(named) from error
             raise
 
     async def _until_answered(
@@ -238,7 +213,7 @@ class Servers:
                 failed = failures.get(server)
                 if failed is not None and left_s < deadline.timeout_s / 2:
                     raise failed from failed.__cause__  # this failure took most of the time
-                raise deadline.exceeded(error.server or server.transport.url) from error
+                raise deadline.exceeded(with_proxy(server.transport.url)) from error
             except (AccessDeniedError, InferenceFailedError, ModelNotFoundError) as error:
                 refusals[server] = error
                 if not self._retry:
@@ -268,7 +243,7 @@ class Servers:
                 if deadline.ends_within(0):  # the pause took longer than planned
                     raise
             else:
-                server.failures, server.has_answered = 0, True
+                server.failures = 0
                 for other, refusal in refusals.items():  # not before: if all refuse, no server is at fault
                     self._leave_out(other, model, refusal)
                 return answer
@@ -289,16 +264,10 @@ class Servers:
         if server.is_left_out or self._is_closed:
             return  # the same failure, or closing
         server.failures += 1
-        if error.may_have_ended_server:
-            was_down = not isinstance(error, ProcessEndedError)
-            server.comeback = asyncio.create_task(server.back(model, was_down=was_down))
-        elif len(self._servers) > 1:
-            server.comeback = asyncio.create_task(server.rested(model))
-
-    async def _wrong_ports(self) -> list[str | None]:
-        """Return what is wrong with each server's port; None: no fault found."""
-        ours = [server.transport.url for server in self._servers if isinstance(server.transport, TritonTransport)]
-        return [await asyncio.to_thread(wrong_port, url) for url in ours]
+        if error.may_have_ended_server or len(self._servers) > 1:
+            rest_s = 0.0 if error.may_have_ended_server else pause_s(server.failures - 1, LONGEST_REST_S)
+            restart_s = RESTART_S if isinstance(error, ProcessEndedError) else 0.0  # Triton 2.51: the dead are ready
+            server.comeback = asyncio.create_task(server.back(model, rest_s, restart_s))
 
 
 def _is_task_cancelled() -> bool:

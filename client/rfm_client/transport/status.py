@@ -9,36 +9,27 @@ from __future__ import annotations
 import asyncio
 import re
 import textwrap
-import time
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from http.client import HTTPException
 from typing import Any, TypeAlias
 
 from tritonclient.utils import InferenceServerException
 
 from rfm_client.contract import triton
-from rfm_client.contract.addresses import open_url, split_url
-from rfm_client.contract.errors import DeadlineExceededError, ServerUnavailableError
+from rfm_client.contract.addresses import open_url, split_url, with_proxy
+from rfm_client.contract.errors import DeadlineExceededError
 from rfm_client.contract.wire import encoder_name, frames_name
-from rfm_client.transport.calls import connect
-from rfm_client.transport.connection import WRONG_PORT_ERRORS, Credentials, wrong_port
+from rfm_client.transport.calls import TritonTransport
+from rfm_client.transport.connection import Credentials
 
 METRICS_PORT = 8002
 METRICS_OPTION = "--metrics-url"
 _PROCESSOR = "CPU"
 _FRAMES = frames_name("")  # ends the names of models for raw frames
-PENDING_METRIC = "nv_inference_pending_request_count"
 
-_DEVICE_METRIC = re.compile("nv_(cpu|gpu)_(utilization|memory_used_bytes|memory_total_bytes)")
-_REQUESTS_METRIC = "nv_inference_request_success_total"
-_COMPUTE_METRIC = "nv_inference_compute_infer_duration_us_total"
-_BATCH_SAMPLES_METRIC = "rfm_batch_samples"
-_SAMPLES_METRIC, _REFUSED = "rfm_samples_total", "refused"  # a value for the label ``outcome``
-_SCORING_METRICS = ("rfm_collate_seconds", "rfm_forward_seconds")
-_SAMPLED_METRIC = "nv_cpu_memory_used_bytes"
-_SAMPLING_S = 2.5  # Triton measures devices every two seconds; before the first time, it reports zeros
-_POLL_S = 0.2
+_DEVICE_METRIC = re.compile("nv_(?:cpu|gpu)_(utilization|memory_used_bytes|memory_total_bytes)")
+_WORK_METRICS = {"nv_inference_request_success_total": "requests", "nv_inference_compute_infer_duration_us_total": "us"}
 _REASON_CHARACTERS = 120
 _STATES = {True: "READY", False: "UNAVAILABLE"}  # for a loaded model
 _NS_PER_MS = 1e6
@@ -46,6 +37,7 @@ _MS_PER_S = 1e3
 _US_PER_S = 1e6
 
 _Version: TypeAlias = tuple[str, str]  # a model's name and version
+_Metrics: TypeAlias = Sequence[Any]  # prometheus_client's samples
 _ServerState: TypeAlias = tuple[  # version, readiness, and every model's index entry and statistics
     str, bool, dict[_Version, tuple[Mapping[str, Any], Mapping[str, Any]]]
 ]
@@ -123,7 +115,7 @@ class ModelStatus:
 
 @dataclass(frozen=True)
 class Device:
-    """The processor (``CPU``), or a GPU by UUID. None: Triton does not report the value.
+    """The processor (``CPU``), or a GPU by UUID. None: Triton does not report the value, or not yet.
 
     utilization: 0..1
     work: work on this device, by model name
@@ -196,14 +188,10 @@ class ServerStatus:
         try:
             version, is_ready, models = await _state(url, timeout_s, credentials)
         except DeadlineExceededError as late:
-            raise DeadlineExceededError(f"{late.server or url}: no answer within {timeout_s:g} s") from late
-        except WRONG_PORT_ERRORS as error:
-            if named := await asyncio.to_thread(wrong_port, url):
-                raise ServerUnavailableError(named) from error
-            raise
-        metrics = await asyncio.to_thread(_read_metrics, metrics_url, timeout_s)
+            raise DeadlineExceededError(f"{with_proxy(url)}: no answer within {timeout_s:g} s") from late
+        metrics, fault = await asyncio.to_thread(_read_metrics, metrics_url, timeout_s)
         read = tuple(_model(entry, done, {*models}, metrics) for entry, done in models.values())
-        return cls(url, version, is_ready, read, metrics_url, metrics.error, metrics.devices)
+        return cls(url, version, is_ready, read, metrics_url, fault, _devices(metrics))
 
     @property
     def checkpoints(self) -> list[str]:
@@ -212,18 +200,9 @@ class ServerStatus:
         return sorted(name.removesuffix(_FRAMES) for name in ready if name.endswith(_FRAMES))
 
 
-@dataclass(frozen=True)
-class _Metrics:
-    devices: tuple[Device, ...] = ()
-    pending: Mapping[_Version, int] = field(default_factory=dict)
-    batches: Mapping[_Version, Batches] = field(default_factory=dict)
-    refused: Mapping[_Version, int] = field(default_factory=dict)
-    error: str | None = None
-
-
 async def _state(url: str, timeout_s: float, credentials: Credentials | None) -> _ServerState:
     """Return the server's version, whether it is ready, and every model's index entry and statistics."""
-    transport = connect(url, credentials=credentials)
+    transport = TritonTransport(url, credentials)
 
     async def request(client: Any) -> _ServerState:
         version = (await client.get_server_metadata(**transport.as_json))["version"]
@@ -234,19 +213,17 @@ async def _state(url: str, timeout_s: float, credentials: Credentials | None) ->
         except InferenceServerException as error:
             if triton.RESTRICTED not in (error.message() or ""):
                 raise
-            loaded = sorted(
-                ((each["name"], each["version"]) for each in statistics), key=lambda key: (key[0], int(key[1]))
-            )
+            loaded = sorted((each["name"], int(each["version"])) for each in statistics)
             index = [
-                {"name": name, "version": version, "state": _STATES[await client.is_model_ready(name, version)]}
-                for name, version in loaded
+                {"name": name, "version": str(number), "state": _STATES[await client.is_model_ready(name, str(number))]}
+                for name, number in loaded
             ]
         done = {(each["name"], each["version"]): each for each in statistics}
         entries = {(each["name"], each.get("version", "")): each for each in index}
         return version, await client.is_server_ready(), {key: (entries[key], done.get(key, {})) for key in entries}
 
     try:
-        return await transport.ask(request, timeout_s)
+        return await transport.call(request, timeout_s)
     finally:
         await transport.close()
 
@@ -260,6 +237,8 @@ def _model(
     encoder = encoder_name(key[0].removesuffix(_FRAMES))
     is_ensemble = key[0].endswith(_FRAMES) and encoder in {name for name, _ in known}
     failures = 2 if is_ensemble else 1  # how often Triton counts a failed request
+    pending = _total(metrics, key, "nv_inference_pending_request_count")
+    refused = _total(metrics, key, "rfm_samples_total", outcome="refused")
     return ModelStatus(
         name=key[0],
         version=key[1],
@@ -267,14 +246,14 @@ def _model(
         reason=" ".join(entry.get("reason", "").split()),
         requests_succeeded=_whole(times, "success", "count"),
         requests_failed=_whole(times, "fail", "count") // failures,
-        requests_pending=metrics.pending.get(key),
+        requests_pending=None if pending is None else int(pending),
         samples=int(done.get("inference_count", 0)),
         executions=int(done.get("execution_count", 0)),
         queue_ms=_whole(times, "queue", "ns") / _NS_PER_MS,
         compute_ms=sum(_whole(batch, "compute_infer", "ns") for batch in done.get("batch_stats", [])) / _NS_PER_MS,
         last_used_s=int(done.get("last_inference", 0)) / _MS_PER_S or None,
-        batches=metrics.batches.get(key),
-        samples_refused=metrics.refused.get(key),
+        batches=_batches(metrics, key),
+        samples_refused=None if refused is None else int(refused),
     )
 
 
@@ -283,68 +262,54 @@ def _whole(statistics: Mapping[str, Any], name: str, key: str) -> int:
     return int(statistics.get(name, {}).get(key, 0))
 
 
-def _read_metrics(url: str, timeout_s: float) -> _Metrics:
-    try:
-        samples = _scrape(url, timeout_s)
-        sampled_by_s = time.monotonic() + _SAMPLING_S
-        while any(each.name == _SAMPLED_METRIC and not each.value for each in samples):
-            if time.monotonic() >= sampled_by_s:
-                break
-            time.sleep(_POLL_S)
-            samples = _scrape(url, timeout_s)
-    except (OSError, HTTPException, ValueError) as error:
-        reason = textwrap.shorten(str(error), _REASON_CHARACTERS)
-        return _Metrics(error=f"no metrics of the machine: {url}: {reason}: give their URL ({METRICS_OPTION})")
-    refused = [sample for sample in samples if sample.labels.get("outcome") == _REFUSED]
-    num_samples = _totals(samples, f"{_BATCH_SAMPLES_METRIC}_sum")
-    scoring_s = _totals(samples, *(f"{name}_sum" for name in _SCORING_METRICS))
-    return _Metrics(
-        devices=_devices(samples),
-        pending={version: int(count) for version, count in _totals(samples, PENDING_METRIC).items()},
-        batches={  # foreign models and older exports report none
-            version: Batches(int(count), int(num_samples[version]), scoring_s[version] * _MS_PER_S)
-            for version, count in _totals(samples, f"{_BATCH_SAMPLES_METRIC}_count").items()
-        },
-        refused={version: int(count) for version, count in _totals(refused, _SAMPLES_METRIC).items()},
-    )
-
-
-def _scrape(url: str, timeout_s: float) -> list[Any]:
+def _read_metrics(url: str, timeout_s: float) -> tuple[_Metrics, str | None]:
+    """Return the metrics, and why there are none."""
     from prometheus_client.parser import text_string_to_metric_families
 
-    with open_url(url, timeout_s) as answer:
-        families = text_string_to_metric_families(answer.read().decode())
-        return [sample for family in families for sample in family.samples]
+    try:
+        with open_url(url, timeout_s) as answer:
+            families = list(text_string_to_metric_families(answer.read().decode()))
+    except (OSError, HTTPException, ValueError) as error:
+        reason = textwrap.shorten(str(error), _REASON_CHARACTERS)
+        return [], f"no metrics of the machine: {url}: {reason}: give their URL ({METRICS_OPTION})"
+    return [sample for family in families for sample in family.samples], None
 
 
-def _totals(samples: list[Any], *names: str) -> dict[_Version, float]:
-    """Return the sum of these metrics over all instances, by version."""
-    totals: dict[_Version, float] = {}
-    for sample in samples:
-        if sample.name in names:
-            version = sample.labels["model"], sample.labels["version"]
-            totals[version] = totals.get(version, 0.0) + sample.value
-    return totals
+def _total(metrics: _Metrics, version: _Version, *names: str, **labels: str) -> float | None:
+    """Return the sum of these metrics over all instances; None: there are none."""
+    wanted = {"model": version[0], "version": version[1], **labels}.items()
+    values = [sample.value for sample in metrics if sample.name in names and wanted <= sample.labels.items()]
+    return sum(values) if values else None
 
 
-def _devices(samples: list[Any]) -> tuple[Device, ...]:
+def _batches(metrics: _Metrics, version: _Version) -> Batches | None:
+    """Return the batches of a version; None: foreign models and older exports report none."""
+    count = _total(metrics, version, "rfm_batch_samples_count")
+    samples = _total(metrics, version, "rfm_batch_samples_sum")
+    scoring_s = _total(metrics, version, "rfm_collate_seconds_sum", "rfm_forward_seconds_sum")
+    if count is None or samples is None or scoring_s is None:
+        return None
+    return Batches(int(count), int(samples), scoring_s * _MS_PER_S)
+
+
+def _devices(metrics: _Metrics) -> tuple[Device, ...]:
     """Return the devices, with the work done there by each model. A count without a GPU belongs to the processor."""
     values: dict[str, dict[str, float]] = {}
-    work: dict[str, dict[str, DeviceWork]] = {}
-    for sample in samples:
-        match = _DEVICE_METRIC.fullmatch(sample.name)
-        if match:
-            values.setdefault(sample.labels.get("gpu_uuid", match[1].upper()), {})[match[2]] = sample.value
-        if sample.name in (_REQUESTS_METRIC, _COMPUTE_METRIC):
-            models, model = work.setdefault(sample.labels.get("gpu_uuid", _PROCESSOR), {}), sample.labels["model"]
-            done = models.get(model, DeviceWork(0, 0.0))
-            if sample.name == _REQUESTS_METRIC:
-                models[model] = replace(done, requests=done.requests + int(sample.value))
-            else:
-                models[model] = replace(done, compute_s=done.compute_s + sample.value / _US_PER_S)
+    work: dict[str, dict[str, dict[str, float]]] = {}
+    for sample in metrics:
+        device = sample.labels.get("gpu_uuid", _PROCESSOR)
+        if match := _DEVICE_METRIC.fullmatch(sample.name):
+            values.setdefault(device, {})[match[1]] = sample.value
+        elif sample.name in _WORK_METRICS:
+            done = work.setdefault(device, {}).setdefault(sample.labels["model"], {"requests": 0.0, "us": 0.0})
+            done[_WORK_METRICS[sample.name]] += sample.value
     return tuple(
         Device(
-            name, of.get("utilization"), of.get("memory_used_bytes"), of.get("memory_total_bytes"), work.get(name, {})
+            name,
+            of.get("utilization"),
+            of.get("memory_used_bytes") or None,  # Triton reports zeros until it has measured
+            of.get("memory_total_bytes") or None,
+            {model: DeviceWork(int(d["requests"]), d["us"] / _US_PER_S) for model, d in work.get(name, {}).items()},
         )
         for name, of in values.items()
     )

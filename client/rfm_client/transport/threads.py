@@ -99,11 +99,18 @@ class LoopThread:
         coroutine.close()
         raise error
 
-    def wait(self, coroutine: Coroutine[Any, Any, Returned]) -> Returned:
-        """Return the coroutine's result. Raises RuntimeError in a future's callback, which would wait for itself."""
+    def check_caller(self) -> None:
+        """Raise RuntimeError in a future's callback, which would wait for itself."""
         if threading.current_thread() is self._thread:
-            coroutine.close()
             raise RuntimeError("expected a call from another thread, got one from a callback of a future: use submit")
+
+    def wait(self, coroutine: Coroutine[Any, Any, Returned]) -> Returned:
+        """Return the coroutine's result. Raises RuntimeError as ``check_caller`` does."""
+        try:
+            self.check_caller()
+        except RuntimeError:
+            coroutine.close()
+            raise
         future = self.start(coroutine)
         try:
             return future.result()

@@ -134,15 +134,6 @@ class Encoders:
         cache: embedding cache, which encodes equal frames and tasks once; None: no cache, and no named frames
         """
         execution = execution or Execution()
-        with execution.forwarding():
-            return self._encoded(samples, execution, cache)
-
-    def _encoded(
-        self,
-        samples: Sequence[EncoderSample],
-        execution: Execution,
-        cache: FeatureCache[Float32Array] | None,
-    ) -> list[EncoderSample | RewardError]:
         outcomes: dict[int, EncoderSample | RewardError] = {}
         for index, encoder_sample in enumerate(samples):
             try:
@@ -155,7 +146,8 @@ class Encoders:
         if good:
             trajectories = [trajectory for index in good for trajectory in samples[index].trajectories]
             tasks = [samples[index].trajectories[0].task for index in good]
-            videos, texts = self._all_of(trajectories, tasks, execution, cache)
+            with execution.forwarding():
+                videos, texts = self._all_of(trajectories, tasks, execution, cache)
             remaining = iter(videos)
             for index, text in zip(good, texts, strict=True):
                 outcomes[index] = _embedded([next(remaining) for _ in samples[index].trajectories], text)

@@ -19,7 +19,6 @@ from rfm.files import (
     PIL_BICUBIC,
     PREPROCESSOR_CONFIG,
     check_one_form,
-    is_there,
     local_copy,
     read_json,
 )
@@ -153,8 +152,6 @@ def load_config(source: str | Path, known: Sequence[str]) -> Any:
     from transformers import AutoConfig
 
     folder = local_copy(source)
-    if not is_there(folder / NETWORK_CONFIG):
-        raise OSError(f"{source}: expected {NETWORK_CONFIG}, got none")
     kind = read_json(folder / NETWORK_CONFIG).get("model_type")
     if kind not in known:
         raise ValueError(f"{source}: model_type: expected one of {', '.join(known)}, got {kind}")
@@ -163,10 +160,7 @@ def load_config(source: str | Path, known: Sequence[str]) -> Any:
 
 def load_preprocessor(source: str | Path) -> ImagePreprocessor:
     """Load an image model's preprocessing. Raises OSError, ValueError, CheckpointError."""
-    file = local_copy(source) / PREPROCESSOR_CONFIG
-    if not is_there(file):
-        raise OSError(f"{source}: expected {PREPROCESSOR_CONFIG}, got none")
-    config = read_json(file)
+    config = read_json(local_copy(source) / PREPROCESSOR_CONFIG)
     return ImagePreprocessor.from_config(config, f"{source}/{PREPROCESSOR_CONFIG}")
 
 

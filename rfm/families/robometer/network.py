@@ -98,7 +98,7 @@ class VlmRewardModel(nn.Module):
         """Return the logits for every frame and query in a batch on the network's device."""
         hidden, made = qwen_states(self.model, batch, graphs=self.graphs)
         frames = self._frame_states(hidden, batch.spans, batch.num_span_tokens)
-        queries = hidden[batch.query_rows, batch.query_tokens]
+        queries = hidden[batch.queries]
         return VlmOutput(
             self.progress_head(frames),
             self.success_head(frames).squeeze(-1) if self.config.has_success else None,
@@ -112,11 +112,11 @@ class VlmRewardModel(nn.Module):
 
         Spans are packed one after the other, [num_tokens, D], so that a long span adds no padding to the others.
         """
-        rows, starts, stops = spans.unbind(dim=1)
+        starts, stops = spans.unbind(dim=1)
         lengths = stops - starts
         span = torch.arange(len(spans), device=spans.device).repeat_interleave(lengths, output_size=num_tokens)
         offset = torch.arange(num_tokens, device=spans.device) - (lengths.cumsum(0) - lengths)[span]
-        states = hidden[rows[span], starts[span] + offset]
+        states = hidden[starts[span] + offset]
         if self.config.pools_by_attention:
             scores = self.frame_pool_attn(states).squeeze(-1) / self.config.pooling_temperature
             states = states * _softmax_of_each(scores, lengths, span).unsqueeze(-1)

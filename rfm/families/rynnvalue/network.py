@@ -198,19 +198,12 @@ class RynnBatch(VlmBatch):
         """Return the batch whose spans hold, for each frame, its relative values (if any) and its values (if any)."""
         packs = [each.input_ids.flatten() for each in batch.packs]
         ids = torch.cat([batch.inputs["input_ids"].flatten(), *packs]).numpy()
-        length = batch.inputs["input_ids"].shape[1]
-        rows, starts, stops = batch.spans.numpy().reshape(-1, 3).T
-        firsts, ends = rows * length + starts, rows * length + stops
-        firsts, ends = firsts[starts < stops], ends[starts < stops]
+        firsts, ends = batch.spans[batch.spans[:, 0] < batch.spans[:, 1]].numpy().T
         has_relative = ids[firsts] == relative_token
         behind = firsts + has_relative * relative_copies
         found = behind[behind < ends], firsts[has_relative]
         values, relatives = (torch.from_numpy(np.ascontiguousarray(each)) for each in found)
         return cls(**vars(batch), values=values, relatives=relatives)
-
-    def _changed(self, change: Callable[[Tensor], Tensor]) -> RynnBatch:
-        own = {"values": change(self.values), "relatives": change(self.relatives)}
-        return RynnBatch(**{**vars(super()._changed(change)), **own})
 
 
 @dataclass(frozen=True)
@@ -241,8 +234,7 @@ class RynnNetwork(nn.Module):
 
     def forward(self, batch: RynnBatch) -> RynnOutput:
         """Return the logits for every group in a batch on the network's device."""
-        hidden, made = qwen_states(self.model, batch, graphs=self.graphs)
-        states = hidden.flatten(0, 1)
+        states, made = qwen_states(self.model, batch, graphs=self.graphs)
         values = _of_groups(states, batch.values, self.config.value_copies)
         relatives = _of_groups(states, batch.relatives, self.config.relative_copies)
         logits = torch.stack([head(values) for head in self.value_heads])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rfm_client.command_line import PlotOutput, number, print_table, with_options
+from rfm_client.command_line import JsonOutput, number, print_table, with_options
 from rfm_client.options import setting
 
 if TYPE_CHECKING:
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 LEGEND = (
     "VOC: rank correlation of progress with time, mean over {}. AUROC: of success, by the vote of the last three "
     "frames, and of progress at the last frame; 0.5 is chance. Threshold: of the vote, with the best balanced accuracy."
-    " Falls: steps on which progress falls by more than 0.01. Frames/s: of the run that labelled, with decoding."
+    " Falls: steps on which progress falls by more than 0.01."
 )
 
 
 @dataclass(frozen=True)
-class EvaluationOutput(PlotOutput):
+class EvaluationOutput(JsonOutput):
     """Output files for an evaluation."""
 
     plot: Path | None = setting(
@@ -59,7 +59,7 @@ def evaluate(
     """
     from rfm_labels import DatasetError, evaluate_labels, find_label_files, read_outcomes
 
-    output.check_folders()
+    output.begin()
     if not dataset.exists():
         raise DatasetError.at(dataset, "a labelled dataset", "no file or folder of this name")
     files = labels or find_label_files(dataset)
@@ -78,9 +78,9 @@ def evaluate(
 
 
 def _print_tables(comparison: LabelComparison) -> None:
-    """Print one table for the models, and one for pairwise agreement."""
+    """Print a row for each label file."""
     known, rows = comparison.is_success, []
-    columns = ["labels", "VOC rho", "VOC tau", "no VOC", "final", "falls", "frames/s"]
+    columns = ["labels", "VOC rho", "VOC tau", "no VOC", "final", "falls"]
     if known is not None:
         columns[5:5] = ["of successes", "of failures", "AUROC success", "AUROC progress", "threshold", "accuracy"]
     for each in comparison.evaluations:
@@ -92,7 +92,7 @@ def _print_tables(comparison: LabelComparison) -> None:
             cells += [number(ranking.auroc if ranking else None, 3) for ranking in (success, progress)]
             cells.append(number(success.threshold if success else None, 3))
             cells.append(number(success.balanced_accuracy if success else None, 3))
-        rows.append([*cells, f"{each.backwards:.1%}", number(each.frames_per_s, 1)])
+        rows.append([*cells, f"{each.backwards:.1%}"])
     counts = f"{len(comparison.episodes)} episodes"
     if known is not None:
         counts += f": {int(known.sum())} successes, {int((~known).sum())} failures"
@@ -101,25 +101,14 @@ def _print_tables(comparison: LabelComparison) -> None:
     if comparison.num_without_outcome:
         counts += f"; {comparison.num_without_outcome} left out, whose outcome is empty"
     print_table(counts, columns, rows)
-    if comparison.agreements:
-        pairs = [
-            [each.first, each.second, number(each.spearman, 3), number(each.distance, 3)]
-            for each in comparison.agreements
-        ]
-        print_table("agreement on progress", ["labels", "and", "rho", "distance"], pairs, names=2)
 
 
 def document(comparison: LabelComparison) -> dict[str, Any]:
     """Return the document for ``evaluate --json``."""
-    evaluations = []
-    for each in comparison.evaluations:
-        fields = asdict(each)
-        evaluations.append({**fields, "final_progress": each.final_progress.tolist()})
-    return {
-        "episodes": list(comparison.episodes),
-        "is_success": None if comparison.is_success is None else comparison.is_success.tolist(),
-        "num_left_out": comparison.num_left_out,
-        "num_without_outcome": comparison.num_without_outcome,
-        "evaluations": evaluations,
-        "agreements": [asdict(each) for each in comparison.agreements],
-    }
+    is_success = comparison.is_success
+    numbers = [each.final_progress.tolist() for each in comparison.evaluations]
+    evaluations = [
+        {**asdict(each), "final_progress": own} for each, own in zip(comparison.evaluations, numbers, strict=True)
+    ]
+    arrays = {"is_success": None if is_success is None else is_success.tolist(), "evaluations": evaluations}
+    return asdict(comparison) | arrays

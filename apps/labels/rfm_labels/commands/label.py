@@ -16,7 +16,7 @@ from rfm_client import RewardError
 from rfm_client.command_line import ExitCode, ServerOptions, print_table, report, with_options
 from rfm_client.frames import ChannelOrder, Orientation
 from rfm_client.options import ConfigError, Settings, setting
-from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset, DatasetEpisode, SeveralTasks, parsed_by_camera
+from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, SeveralTasks, parsed_by_camera
 from rfm_labels.datasets.faults import FaultsError, UnusedTaskError, listed, require
 from rfm_labels.datasets.hdf5 import label_prefix
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
@@ -29,7 +29,7 @@ from rfm_labels.options import LabelOptions, RayOptions, Watch
 from rfm_labels.plan import checked_episodes
 from rfm_labels.ray_engine import Connect, label_with_ray
 from rfm_labels.scorer import ClientScorer, Scorer
-from rfm_labels.summary import Summary, summarise
+from rfm_labels.summary import summarise
 
 SPEED_OVER_S = 600.0  # an episode may take minutes
 Printer: TypeAlias = Callable[[str], None]
@@ -167,14 +167,13 @@ class EpisodeTexts(Settings):
 
 @dataclass(frozen=True)
 class RunOptions(Settings):
-    """Engine, trial run and summary of a labelling command."""
+    """Engine, trial run and report of a labelling command."""
 
     TITLE: ClassVar[str] = "Run"
 
     engine: Literal["threads", "ray"] = setting("threads", "threads: in this process. ray: by actors of a Ray cluster.")
     dry_run: bool = setting(False, "Check everything, count, write nothing.")
     report: bool = setting(False, "Only show the summary of labels that are there.")
-    picture: bool = setting(True, "Draw the summary: NAME_summary.png in the output.")
 
 
 @with_options
@@ -262,11 +261,11 @@ class LabelCommand:
                 unused.append(error)
                 command = replace(command, texts=replace(command.texts, task=None))
             except RewardError as error:
-                messages = error.lines if isinstance(error, FaultsError) else [str(error)]
+                messages = str(error).splitlines() if isinstance(error, FaultsError) else [str(error)]
                 lines += [line if command.source in line else f"{command.source}: {line}" for line in messages]
             checked.append(command)
         if lines:
-            raise FaultsError.listing(lines)
+            raise FaultsError("\n".join(lines))
         if len(unused) == len(commands):
             raise unused[0]
         return checked
@@ -314,7 +313,7 @@ class LabelCommand:
         if report.summary is None:
             self.say(f"this shard is labelled; the same command without --shard writes the files from {report.parts}")
             return ExitCode.OK
-        self._show(report.summary, report.files[0])
+        _print(report.summary.rows())
         for file in report.files:
             typer.echo(f"{file}")
         return ExitCode.OK
@@ -330,18 +329,7 @@ class LabelCommand:
         summary = summarise(path)
         for line in blank_lines(read_blank(path), len(summary.episodes)):
             self.say(f"note: {line}")
-        self._show(summary, path)
-
-    def _show(self, summary: Summary, file: Path) -> None:
         _print(summary.rows())
-        if self.options.picture:
-            from rfm_labels.pictures import draw_summary
-
-            beside = file.parent.parent if file.parent.name == SIGNALS_FOLDER else file.parent
-            named = f"{label_prefix(Path(self.source))}{self.labels.name}_summary.png"
-            picture = (self.labels.output or beside) / named
-            draw_summary(picture, summary, file)
-            typer.echo(f"{picture}")
 
     def _dataset(self) -> Dataset:
         return open_dataset(self.source, **self.texts.opening)

@@ -75,18 +75,15 @@ class AskedCorrections:
         channels: ChannelOrder | Mapping[str, ChannelOrder] | None,
     ) -> AskedCorrections:
         """Accept a value for all cameras or by camera; None: not given. Raises DatasetError for an unknown value."""
-        asked = cls(
-            {"": orient} if isinstance(orient, str) else orient or {},
-            {"": channels} if isinstance(channels, str) else channels or {},
-        )
-        try:
-            for turn in asked.orient.values():
-                Correction(orient=turn)
-            for order in asked.channels.values():
-                Correction(channels=order)
-        except ConfigError as error:
-            raise DatasetError.like(error) from None
-        return asked
+        asked: dict[str, Any] = {}
+        for option, given in (("orient", orient), ("channels", channels)):
+            asked[option] = {"": given} if isinstance(given, str) else given or {}
+            try:
+                for value in asked[option].values():
+                    Correction(**{option: value})
+            except ConfigError as error:
+                raise DatasetError.like(error) from None
+        return cls(**asked)
 
     def of_cameras(
         self,
@@ -99,11 +96,8 @@ class AskedCorrections:
         turns: default orientations, unless the caller gives one
         orders: default channel orders, unless the caller gives one
         """
-        orient = {**({} if "" in self.orient else turns or {}), **_known("orient", self.orient, cameras)}
-        channels = {
-            **({} if "" in self.channels else orders or {}),
-            **_known("channels", self.channels, cameras),
-        }
+        orient = {**(turns or {}), **_known("orient", self.orient, cameras)}
+        channels = {**(orders or {}), **_known("channels", self.channels, cameras)}
         found = {camera: Correction.of(camera, orient, channels) for camera in cameras}
         return {camera: correction for camera, correction in found.items() if correction != Correction()}
 
@@ -195,7 +189,7 @@ class TaskOverride:
 
 
 class Dataset(ABC):
-    """Episodes on disk. Opening a dataset reads its tables, but no frames.
+    """Episodes on disk. Opening a dataset reads its tables, but no frames. ``open_dataset`` gives the caller's wishes.
 
     kind: layout, for example ``LeRobot v3.0``
     root: default folder for labels
@@ -229,7 +223,14 @@ class Dataset(ABC):
     @cached_property
     def episodes(self) -> Sequence[DatasetEpisode]:
         """All episodes, by index. Raises DatasetError with every episode's faults."""
-        episodes = self.read(self.numbers)
+        episodes, faults = [], {}
+        for number in self.numbers:
+            try:
+                episodes.append(self.episode(number))
+            except RewardError as fault:
+                faults[number] = fault
+        if faults:
+            raise FaultsError.of(faults, self.numbers)
         self.given_task.check_used(episodes)
         return episodes
 
@@ -238,18 +239,6 @@ class Dataset(ABC):
         if number not in self._read:
             self._read[number] = self.read_episode(number)
         return self._read[number]
-
-    def read(self, numbers: Sequence[int]) -> list[DatasetEpisode]:
-        """Return the episodes with these numbers. Raises FaultsError."""
-        episodes, faults = [], {}
-        for number in numbers:
-            try:
-                episodes.append(self.episode(number))
-            except RewardError as fault:
-                faults[number] = fault
-        if faults:
-            raise FaultsError.of(faults, numbers)
-        return episodes
 
     @cached_property
     def _read(self) -> dict[int, DatasetEpisode]:
@@ -299,11 +288,11 @@ class Dataset(ABC):
         """Return the library that decodes the camera's frames, with its version; None: they are stored as pixels."""
 
     @abstractmethod
-    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+    def identity(self, episode: DatasetEpisode, camera: str) -> str:
         """Return a text that identifies the episode's stored frames. Raises DatasetError.
 
-        For a video: size and modification time, or SHA-256 with ``verify``. For pictures in a table: their digest,
-        because other programs also write tables.
+        For a video: size and modification time. For pictures in a table: their digest, because other programs also
+        write tables.
         """
 
     @abstractmethod
@@ -314,10 +303,51 @@ class Dataset(ABC):
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         """Yield the T frames in order, uint8 [H, W, 3], as stored, each decoded once. Raises DatasetError."""
 
+    def place(self, episode: DatasetEpisode, camera: str) -> str:
+        """Return where the episode's frames lie, for messages."""
+        return f"{episode.name}: {camera}"
+
     def frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        """Yield the T frames in order, uint8 [H, W, 3], corrected to upright RGB. Raises DatasetError."""
+        """Yield the T ``whole_frames``, corrected to upright RGB."""
         correction = self.corrections.get(camera, Correction())
-        return (correction.applied(frame) for frame in self.stored_frames(episode, camera))
+        return map(correction.applied, self.whole_frames(episode, camera))
+
+    def whole_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
+        """Yield the T ``stored_frames``.
+
+        Raises DatasetError, also for frames of different sizes, and in the end for a wrong count.
+        """
+        where, count, size = self.place(episode, camera), 0, ""
+        for frame in self.stored_frames(episode, camera):
+            own = f"{frame.shape[0]} x {frame.shape[1]} pixels"
+            size = size or own
+            require(f"{where}: frame {count}", own == size, f"a frame of {size}, as the first", own)
+            count += 1
+            if count <= episode.num_frames:
+                yield frame
+        require(where, count == episode.num_frames, f"{episode.num_frames} frames", count)
+
+
+class CountedDataset(Dataset):
+    """A dataset whose frames are numbered by the order of its episodes. Broken episodes count as empty."""
+
+    @abstractmethod
+    def length(self, number: int) -> int:
+        """Return an episode's frame count. Raises DatasetError."""
+
+    def frames_before(self, number: int) -> int:
+        """Return how many frames the episodes before this one have."""
+        place, counts = self.numbers.index(number), self._frames_before
+        for before in self.numbers[len(counts) - 1 : place]:
+            try:
+                counts.append(counts[-1] + self.length(before))
+            except RewardError:  # raised again if that episode is read
+                counts.append(counts[-1])
+        return counts[place]
+
+    @cached_property
+    def _frames_before(self) -> list[int]:
+        return [0]
 
 
 def iter_episodes(

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rfm_client import RewardError
 from rfm_client.options import InvalidValueError, git_lfs_pointer
@@ -43,6 +45,16 @@ def unreadable(file: Path, expected: str, error: object) -> DatasetError:
     return DatasetError.at(file, expected, error)
 
 
+def json_object(file: Path) -> dict[str, Any]:
+    """Read a JSON file. Raises DatasetError unless it holds an object."""
+    try:
+        document = json.loads(file.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise DatasetError.at(file, "a readable JSON file", error) from error
+    require(file, isinstance(document, dict), "a JSON object", type(document).__name__)
+    return dict(document)
+
+
 class MissingTaskError(DatasetError):
     """An episode without a task."""
 
@@ -52,16 +64,7 @@ class UnusedTaskError(DatasetError):
 
 
 class FaultsError(DatasetError):
-    """Several faults, one per line, then the options that help. lines: the message's lines."""
-
-    lines: tuple[str, ...] = ()
-
-    @classmethod
-    def listing(cls, lines: Sequence[str]) -> FaultsError:
-        """Return the error with these lines."""
-        error = cls("\n".join(lines))
-        error.lines = tuple(lines)
-        return error
+    """Several faults, one per line, then the options that help."""
 
     @classmethod
     def of(cls, faults: Mapping[int, RewardError], numbers: Sequence[int]) -> FaultsError:
@@ -81,7 +84,7 @@ class FaultsError(DatasetError):
         others = [number for number in numbers if number not in faults]
         if others:
             lines.append(f"to continue without the faulty episodes: --episodes {listed(others)}")
-        return cls.listing(lines)
+        return cls("\n".join(lines))
 
 
 require = partial(require_that, error=DatasetError)

@@ -15,18 +15,27 @@ import json
 import re
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any
 
-from rfm_client import InvalidSampleError, RewardError, Trajectory, UInt8Array, load_trajectory
+from rfm_client import InvalidSampleError, Trajectory, UInt8Array, load_trajectory
 from rfm_client.frames import Picture, Video
-from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
+from rfm_labels.datasets.dataset import AskedCorrections, CountedDataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, require
-from rfm_labels.datasets.stored_files import Span, digest_of, faults_at, file_identity, turn_mark
+from rfm_labels.datasets.stored_files import (
+    Span,
+    check_pictures,
+    digest_of,
+    faults_at,
+    file_identity,
+    picture_frames,
+    turn_mark,
+)
 
 _NOT_IN_A_WORD = r"(?<![^\W_])"  # after a letter or digit, - and . are separators: frame-1.png, frame.1.png, 2026-11-26
 _NUMBER = re.compile(
@@ -43,8 +52,8 @@ _UNITREE_FILE, _UNITREE_FOLDER = "data.json", "colors"
 
 
 def is_pattern(path: Path) -> bool:
-    """True if the last path component is a file name pattern."""
-    return "*" in path.name
+    """True if the last path component is a file name pattern, and no name of a file or folder that is there."""
+    return "*" in path.name and not path.exists()
 
 
 def matching(pattern: str, files: Sequence[str]) -> list[str]:
@@ -121,66 +130,6 @@ def _several_kinds(folder: Path, names: Sequence[_Name], place: int | None) -> D
     return DatasetError.at(folder, "pictures of one camera, whose names differ in a number", got)
 
 
-@dataclass(frozen=True)
-class Contents:
-    """The episodes in a folder, and what the caller says about them.
-
-    root: folder to which the names are relative
-    tasks: task by episode path; None: no task
-    table: task table, or the folder, for messages
-    """
-
-    root: Path
-    tasks: Mapping[str, str | None]
-    table: Path
-    task: TaskOverride
-    corrections: AskedCorrections
-
-
-class EpisodeFiles(Dataset):
-    """Episodes that are separate files or folders."""
-
-    def __init__(self, contents: Contents) -> None:
-        self.root = contents.root
-        self.source = contents.root.resolve().name
-        self.corrections = contents.corrections.of_cameras(self.cameras)
-        self.given_task = contents.task
-        self.numbers = range(len(contents.tasks))
-        self._contents, self._names = contents, list(contents.tasks)
-        self._lengths: dict[str, int] = {}
-        self._firsts = [0]
-
-    def read_episode(self, number: int) -> DatasetEpisode:
-        """Read an episode, and count the frames before it; broken episodes count as empty. Raises DatasetError."""
-        name = self._names[number]
-        own = self._contents.tasks[name] or self.own_task(self.root / name)
-        task = self.given_task.of(f"{self._contents.table}: {name}", own)
-        num_frames = self._length(name)
-        while len(self._firsts) <= number:
-            self._firsts.append(self._firsts[-1] + self._length_or_0(self._names[len(self._firsts) - 1]))
-        return DatasetEpisode(number, name, " ".join(task.split()), num_frames, self._firsts[number])
-
-    def _length(self, name: str) -> int:
-        if name not in self._lengths:
-            self._lengths[name] = self.length(self.root / name)
-            require(self.root / name, self._lengths[name] > 0, "frames", "none")
-        return self._lengths[name]
-
-    def _length_or_0(self, name: str) -> int:
-        try:
-            return self._length(name)
-        except RewardError:  # raised again if this episode is read
-            return 0
-
-    @abstractmethod
-    def length(self, file: Path) -> int:
-        """Return an episode's frame count. Raises DatasetError."""
-
-    def own_task(self, file: Path) -> str | None:
-        """Return the task stored in an episode's file, or None. Raises DatasetError."""
-        return None
-
-
 def in_natural_order(names: Iterable[str]) -> list[str]:
     """Sort episode names, comparing numbers as integers: ``2`` before ``10``, ``1.2`` before ``1.10``.
 
@@ -194,37 +143,78 @@ def in_natural_order(names: Iterable[str]) -> list[str]:
     return sorted(names, key=key)
 
 
+class EpisodeFiles(CountedDataset):
+    """Episodes that are separate files or folders.
+
+    root: folder to which the names are relative
+    tasks: task by episode name; None: no task
+    table: task table, or the folder, for messages
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        tasks: Mapping[str, str | None],
+        table: Path,
+        task: TaskOverride,
+        corrections: AskedCorrections,
+    ) -> None:
+        self.root = root
+        self.source = root.resolve().name
+        self.numbers = range(len(tasks))
+        self.given_task = task
+        self._tasks, self._table, self._names = tasks, table, list(tasks)
+        self._facts = lru_cache(None)(self.facts)
+        self.corrections = corrections.of_cameras(self.cameras)
+
+    @abstractmethod
+    def facts(self, file: Path) -> tuple[int, str | None]:
+        """Return an episode's frame count, and the task in its file or None. Raises DatasetError."""
+
+    def length(self, number: int) -> int:
+        file = self.root / self._names[number]
+        num_frames, _ = self._facts(file)
+        require(file, num_frames > 0, "frames", "none")
+        return num_frames
+
+    def read_episode(self, number: int) -> DatasetEpisode:
+        name, length = self._names[number], self.length(number)
+        own = self._tasks[name] or self._facts(self.root / name)[1]
+        task = self.given_task.of(f"{self._table}: {name}", own)
+        return DatasetEpisode(number, name, " ".join(task.split()), length, self.frames_before(number))
+
+    def identity(self, episode: DatasetEpisode, camera: str) -> str:
+        return file_identity(self.root / episode.name)
+
+    def check(self, episode: DatasetEpisode, camera: str) -> None:
+        """Check nothing more: ``facts`` has found all frames."""
+
+
 class VideoFolder(EpisodeFiles):
     """Episodes stored as one video file each."""
 
     kind = "videos"
     cameras = ("video",)
 
-    def __init__(self, contents: Contents) -> None:
-        super().__init__(contents)
-        self._videos = lru_cache(_FILES_AT_A_TIME)(Video)
-
-    def length(self, file: Path) -> int:
-        video = self._videos(file)
+    def facts(self, file: Path) -> tuple[int, str | None]:
+        video = self._video(file)
         video.check_is_one_episode()
         with faults_at(file):
             packets = video.packets
         expected = f"{packets.count} frames with time stamps"
         require(file, len(packets.times_s) == packets.count, expected, len(packets.times_s))
-        return packets.count
+        return packets.count, None
+
+    @cached_property
+    def _video(self) -> Callable[[Path], Video]:
+        return lru_cache(_FILES_AT_A_TIME)(Video)
 
     def decoder(self, camera: str) -> str | None:
         return Video.decoder()
 
-    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
-        return file_identity(self.root / episode.name, verify=verify)
-
-    def check(self, episode: DatasetEpisode, camera: str) -> None:
-        """Check nothing more: ``read_episode`` has read all packets."""
-
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         file = self.root / episode.name
-        video = self._videos(file)
+        video = self._video(file)
         with faults_at(file):
             times_s = video.packets.times_s
         gaps_s = times_s[1:] - times_s[:-1]
@@ -238,41 +228,16 @@ class ArrayFiles(EpisodeFiles):
     kind = "arrays"
     cameras = ("frames",)
 
-    def __init__(self, contents: Contents) -> None:
-        super().__init__(contents)
-        self._facts = lru_cache(None)(_facts)
-
-    def length(self, file: Path) -> int:
-        return self._facts(file)[0]
-
-    def own_task(self, file: Path) -> str | None:
-        return self._facts(file)[1]
+    def facts(self, file: Path) -> tuple[int, str | None]:
+        """Read the whole file: only the complete values show whether they are frames."""
+        trajectory = _read(file)
+        return trajectory.num_frames, trajectory.task or None
 
     def decoder(self, camera: str) -> str | None:
         return None
 
-    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
-        return file_identity(self.root / episode.name, verify=verify)
-
-    def check(self, episode: DatasetEpisode, camera: str) -> None:
-        file = self.root / episode.name
-        num_frames = len(_frames(file))
-        require(file, num_frames == episode.num_frames, f"{episode.num_frames} frames", num_frames)
-
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        return iter(_frames(self.root / episode.name))
-
-
-def _facts(file: Path) -> tuple[int, str | None]:
-    """The frame count and the task. Reads the whole file: only the complete values show whether they are frames."""
-    trajectory = _read(file)
-    return trajectory.num_frames, trajectory.task or None
-
-
-def _frames(file: Path) -> UInt8Array:
-    frames = _read(file).frames
-    assert frames is not None  # ``_read`` refuses embeddings
-    return frames
+        return iter(_read(self.root / episode.name).positions)
 
 
 def _read(file: Path) -> Trajectory:
@@ -292,8 +257,8 @@ class FrameFolders(EpisodeFiles):
     kind = "folders of frames"
     cameras: Sequence[str] = ("frames",)
 
-    def length(self, file: Path) -> int:
-        return len(self.files(file, self.cameras[0]))
+    def facts(self, file: Path) -> tuple[int, str | None]:
+        return len(_pictures_in(file)), None
 
     def files(self, place: Path, camera: str) -> Sequence[Path]:
         """Return an episode's frames, in order. Raises DatasetError."""
@@ -302,26 +267,15 @@ class FrameFolders(EpisodeFiles):
     def decoder(self, camera: str) -> str | None:
         return Picture.decoder()
 
-    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+    def identity(self, episode: DatasetEpisode, camera: str) -> str:
         files = self.files(self.root / episode.name, camera)
-        stored = ((file, file_identity(file, verify=verify)) for file in files)
-        return digest_of(f"{file.name} {identity}{turn_mark(file)}".encode() for file, identity in stored)
+        return digest_of(f"{file.name} {file_identity(file)}{turn_mark(file)}".encode() for file in files)
 
     def check(self, episode: DatasetEpisode, camera: str) -> None:
-        for file in self._files(episode, camera):
-            with faults_at(file):
-                Picture(file).check()
+        check_pictures(self.files(self.root / episode.name, camera))
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        for file in self._files(episode, camera):
-            with faults_at(file):
-                yield Picture(file).pixels()
-
-    def _files(self, episode: DatasetEpisode, camera: str) -> Sequence[Path]:
-        folder = self.root / episode.name
-        files = self.files(folder, camera)
-        require(folder, len(files) == episode.num_frames, f"{episode.num_frames} frames", len(files))
-        return files
+        return picture_frames(self.files(self.root / episode.name, camera))
 
 
 def is_of_unitree(folder: Path) -> bool:
@@ -334,16 +288,16 @@ class UnitreeFolders(FrameFolders):
 
     kind = "Unitree"
 
-    def __init__(self, contents: Contents) -> None:
+    def __init__(self, root: Path, tasks: Mapping[str, str | None], *more: Any) -> None:
         self._recording = lru_cache(None)(_recording)
-        for name in contents.tasks:
+        for name in tasks:
             with suppress(DatasetError):  # raised again if this episode is read
-                self.cameras = list(self._recording(contents.root / name)[1])
+                self.cameras = list(self._recording(root / name)[1])
                 break
-        super().__init__(contents)
+        super().__init__(root, tasks, *more)
 
-    def own_task(self, file: Path) -> str | None:
-        return self._recording(file)[0]
+    def facts(self, file: Path) -> tuple[int, str | None]:
+        return len(self.files(file, self.cameras[0])), self._recording(file)[0]
 
     def files(self, place: Path, camera: str) -> Sequence[Path]:
         cameras = self._recording(place)[1]

@@ -11,18 +11,18 @@ are turned, unless the caller says otherwise. robomimic's filter keys (``mask/tr
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
 from rfm_client import RewardError, UInt8Array
 from rfm_client.frames import Orientation, Picture
-from rfm_client.options import first_names
-from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
+from rfm_labels.datasets.dataset import AskedCorrections, CountedDataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, FaultsError, require
 from rfm_labels.datasets.hdf5_layouts import (
-    DOCUMENTS,
     ROBOMIMIC,
     ROBOTWIN,
+    Layout,
     attribute,
     filter_keys,
     fps_of,
@@ -30,22 +30,18 @@ from rfm_labels.datasets.hdf5_layouts import (
     is_of_libero,
     layout_of,
     opened_hdf5,
-    own_task_of,
-    task_in,
     task_of,
     task_places,
-    unread,
     unread_documents,
 )
 from rfm_labels.datasets.hdf5_pictures import (
     EncodedFrames,
     fault_of,
-    first_files,
+    first_file,
     form_of,
-    forms_in,
     has_rgb_mark,
     is_encoded,
-    pictures_in,
+    is_picture,
 )
 from rfm_labels.datasets.stored_files import digest_of
 
@@ -54,7 +50,74 @@ SUFFIXES = (".hdf5", ".h5")
 _FRAMES_AT_A_TIME = 64
 _LIBERO: Orientation = "flip-vertical"  # as in upstream's training data and evaluation
 _LIBERO_CAMERAS = ("agentview_rgb", "eye_in_hand_rgb")
-_ACTIONS = "actions"
+
+
+@dataclass(frozen=True)
+class _Demo:
+    """What a file holds of one episode.
+
+    missing: why it lacks other observations
+    forms: type and shape by observation
+    faults: by observation, why it is no camera's frames; empty: it is
+    pictures: observations that may be pictures
+    lengths: frame count by camera
+    marks: by camera whose frames are files, whether the first has RoboTwin's mark of RGB
+    num_actions: None: not in the file
+    """
+
+    name: str
+    task: Any
+    missing: str
+    forms: Mapping[str, str]
+    faults: Mapping[str, str]
+    pictures: Sequence[str]
+    lengths: Mapping[str, int]
+    marks: Mapping[str, bool]
+    num_actions: int | None
+
+    @classmethod
+    def read(cls, name: str, group: Any, task: Any, layout: Layout) -> _Demo:
+        observations = layout.observations(group)
+        are_pictures, skipped = layout.are_pictures, layout.skipped
+        faults = {
+            each: f"{name} has a broken link or no array" if value is None else fault_of(value, are_pictures)
+            for each, value in observations.items()
+        }
+        cameras = {each: observations[each] for each, fault in faults.items() if not fault}
+        actions = getattr(group.get(layout.actions) if cameras and layout.actions else None, "shape", None)
+        return cls(
+            name,
+            task,
+            f"{name} is a broken link" if group is None else f"missing in {name}",
+            {each: form_of(value) for each, value in observations.items()},
+            faults,
+            [each for each, value in observations.items() if is_picture(value, are_pictures)],
+            {each: len(value) - skipped for each, value in cameras.items()},
+            {
+                each: has_rgb_mark(first_file(value))
+                for each, value in cameras.items()
+                if is_encoded(value, are_pictures)
+            },
+            actions[0] - skipped if actions else None,
+        )
+
+    def fault(self, picture: str) -> str:
+        """Return why the episode lacks a camera; empty if it has it."""
+        return self.faults.get(picture, self.missing)
+
+    def counts(self, cameras: Sequence[str]) -> dict[str, int]:
+        """Return the frame count per camera, and the action count if present."""
+        counts = {f"obs/{camera}": self.lengths[camera] for camera in cameras or self.lengths}
+        return counts | ({} if self.num_actions is None or not counts else {"actions": self.num_actions})
+
+    def num_frames(self, cameras: Sequence[str]) -> int:
+        """Return the frame count, equal in all cameras; 0 if cameras differ or there are none.
+
+        The action count must be the same, or one less if the last observation has no action; otherwise 0.
+        """
+        lengths = {self.lengths[camera] for camera in cameras or self.lengths}
+        length = lengths.pop() if len(lengths) == 1 else 0
+        return length if self.num_actions in (None, length, length - 1) else 0
 
 
 def is_hdf5(path: Path) -> bool:
@@ -67,14 +130,8 @@ def label_prefix(path: Path) -> str:
     return f"{path.stem}." if path.suffix.lower() in SUFFIXES else ""
 
 
-class Hdf5Dataset(Dataset):
-    """The demonstrations in one file.
-
-    task: task from the caller
-    corrections: corrections from the caller; without an orientation, LIBERO cameras are turned
-    """
-
-    kind = "HDF5"
+class Hdf5Dataset(CountedDataset):
+    """The demonstrations in one file. LIBERO's cameras are turned, unless the caller says otherwise."""
 
     def __init__(
         self, file: Path, *, task: TaskOverride = TaskOverride(), corrections: AskedCorrections = AskedCorrections()
@@ -85,69 +142,52 @@ class Hdf5Dataset(Dataset):
         self.source = file.name
         self.given_task = task
         with opened_hdf5(file) as opened:
-            self._layout = layout_of(opened)
-            demos = self._layout.episodes(file, opened)
-            self._demos = {index: name for index, (name, _) in demos.items()}
-            self._pictures = pictures_in(demos, self._layout.are_pictures)
-            self._forms = forms_in(demos)
-            attributes = (opened["data"] if self._layout.is_in_data else opened).attrs
-            self._tasks = {index: self._task_in(opened, demo, attributes) for index, (_, demo) in demos.items()}
-            self.filter_keys, notes = filter_keys(opened, self._demos)
-            self.cameras, self.left_out = self._shared(list(demos))
-            self._lengths = {
-                index: self._lengths_of(demo, self.cameras or self._cameras_of(index))
-                for index, (_, demo) in demos.items()
+            self._layout = layout = layout_of(opened)
+            groups = layout.episodes(file, opened)
+            attributes = (opened["data"] if layout.is_in_data else opened).attrs
+            self._demos = {
+                number: _Demo.read(name, group, task_of(file, opened, group, layout), layout)
+                for number, (name, group) in groups.items()
             }
+            self.filter_keys = filter_keys(opened)
             self._broken = unread_documents(attributes)
-            others = unread(opened, self._demos.values()) if self._layout.is_in_data else []
-            notes = [*others, *notes, *_notes_on_samples(demos, self._lengths, self._layout.skipped)]
-            notes += [
-                f"data: {name} is not a JSON object, so it states neither a task nor LIBERO" for name in self._broken
-            ]
-            is_libero = self._layout is ROBOMIMIC and is_of_libero(attributes)
-            self.fps = self._layout.fps or fps_of(attributes)
-            self._firsts = first_files(demos, self._pictures, self._layout.are_pictures)
+            is_libero = layout is ROBOMIMIC and is_of_libero(attributes)
+            self.fps = layout.fps or fps_of(attributes)
             is_upright = "opencv" in str(attribute(attributes, "macros_image_convention"))  # robosuite turned frames
-        self.kind = "HDF5" if self._layout is ROBOMIMIC else f"HDF5 ({self._layout.name})"
-        self.numbers = list(demos)
-        known = [camera for camera in self._pictures if any(camera in self._cameras_of(each) for each in self.numbers)]
+        self.kind = "HDF5" if layout is ROBOMIMIC else f"HDF5 ({layout.name})"
+        self.numbers = list(self._demos)
+        self._pictures = list(dict.fromkeys(each for demo in self._demos.values() for each in demo.pictures))
+        self.cameras, self.left_out = self._shared(self.numbers)
+        known = [each for each in self._pictures if any(each in demo.lengths for demo in self._demos.values())]
         if not known:
             self.cameras_in(self.numbers)  # raises the reason
+        self._marks = {camera: mark for demo in self._demos.values() for camera, mark in demo.marks.items()}
+        unmarked = [camera for camera, mark in self._marks.items() if layout is ROBOTWIN and not mark]
         defaults: dict[str, Orientation] = dict.fromkeys(known, _LIBERO) if is_libero and not is_upright else {}
-        is_robotwin = self._layout is ROBOTWIN
-        unmarked = [camera for camera, file in self._firsts.items() if is_robotwin and not has_rgb_mark(file)]
         self.corrections = corrections.of_cameras(known, defaults, dict.fromkeys(unmarked, "bgr"))
         uncorrected = [camera for camera in known if {"", camera}.isdisjoint(corrections.orient)]
-        self.notes = [*notes, *([] if is_upright else _notes(uncorrected, is_libero))]
+        why = "is not a JSON object, so it states neither a task nor LIBERO"
+        self.notes = [f"data: {name} {why}" for name in self._broken]
+        self.notes += [] if is_upright else _notes(uncorrected, is_libero)
         self.notes += self._notes_on_colours(corrections, unmarked) + self._notes_on_layout()
-
-    def _task_in(self, opened: Any, demo: Any, attributes: Mapping[str, Any]) -> Any:
-        return own_task_of(demo) or task_of(attributes) if self._layout.is_in_data else task_in(self.file, opened, demo)
-
-    def _lengths_of(self, demo: Any, cameras: Sequence[str]) -> Mapping[str, int]:
-        """Frame count per camera, and action count if present."""
-        skipped = self._layout.skipped
-        lengths = {f"obs/{camera}": len(demo["obs"][camera]) - skipped for camera in cameras}
-        shape = getattr(demo.get(_ACTIONS), "shape", None) if lengths else None
-        return lengths | ({_ACTIONS: shape[0] - skipped} if shape else {})
 
     def _notes_on_layout(self) -> list[str]:
         if self._layout is ROBOMIMIC:
             return []
-        forms = [f"{camera}{' (JPEG or PNG)' * (camera in self._firsts)}" for camera in self.cameras]
+        forms = [f"{camera}{' (JPEG or PNG)' * (camera in self._marks)}" for camera in self.cameras]
         notes = [f"layout: {self._layout.name}, cameras {', '.join(forms)}"]
         if self._layout.skipped:
             notes.append(
                 "left out: each first picture, which shows the end of the episode before; frame 0 is the second"
             )
         instructions = instructions_of(self.file) if self._layout is ROBOTWIN else []
-        if instructions and self._tasks[0] == instructions[0] and self.given_task.text is None:
+        if instructions and self._demos[0].task == instructions[0] and self.given_task.text is None:
             notes.append(f"task: the first of {len(instructions)} sentences in instructions/{self.file.stem}.json")
         return notes
 
     def _notes_on_colours(self, asked: AskedCorrections, unmarked: Sequence[str]) -> list[str]:
         """A note on red and blue, for cameras without a channel order from the caller."""
-        uncorrected = [camera for camera in self._firsts if {"", camera}.isdisjoint(asked.channels)]
+        uncorrected = [camera for camera in self._marks if {"", camera}.isdisjoint(asked.channels)]
         swapped = [camera for camera in uncorrected if camera in unmarked]
         if swapped:
             why = "RoboTwin's JPEG files without its mark of RGB, from before September 2026, store red as blue"
@@ -155,16 +195,16 @@ class Hdf5Dataset(Dataset):
         colours = self._layout.colours
         return [f"channels: {', '.join(uncorrected)} {colours}"] if uncorrected and colours else []
 
+    def length(self, number: int) -> int:
+        return self._demos[number].num_frames(self.cameras)
+
     def read_episode(self, number: int) -> DatasetEpisode:
-        where = f"{self.file}: {self._layout.group_of(self._demos[number])}".removesuffix(": ")
-        documents = " or ".join(name + " (no JSON object)" * (name in self._broken) for name in DOCUMENTS)
-        places = f"ep_meta, or data: {documents}" if self._layout.is_in_data else task_places(self.file)
-        task = self.given_task.of(f"{where}: {places}", self._tasks[number])
-        lengths = self._lengths[number]
-        got = ", ".join(f"{key} {length}" for key, length in lengths.items()) or self._forms[number]
-        require(where, _one_length(lengths) > 0, "one length, above 0", got)
-        first = sum(_one_length(self._lengths[before]) for before in self.numbers if before < number)
-        return DatasetEpisode(number, self._demos[number], task, _one_length(lengths), first)
+        demo = self._demos[number]
+        where = f"{self.file}: {self._layout.group_of(demo.name)}".removesuffix(": ")
+        task = self.given_task.of(f"{where}: {task_places(self.file, self._layout, self._broken)}", demo.task)
+        counts = ", ".join(f"{key} {count}" for key, count in demo.counts(self.cameras).items())
+        require(where, self.length(number) > 0, "one length, above 0", counts or _described(demo.forms))
+        return DatasetEpisode(number, demo.name, task, self.length(number), self.frames_before(number))
 
     def cameras_in(self, numbers: Sequence[int]) -> tuple[Sequence[str], Mapping[str, str]]:
         cameras, left_out = self._shared(numbers)
@@ -174,36 +214,32 @@ class Hdf5Dataset(Dataset):
 
     def _refuse(self, numbers: Sequence[int], left_out: Mapping[str, str]) -> NoReturn:
         """Raise FaultsError with the demonstrations that lack the most common camera; DatasetError if all do."""
-        lacking_it = [[number for number in numbers if self._pictures[name][number]] for name in left_out]
+        lacking_it = [[number for number in numbers if self._demos[number].fault(name)] for name in left_out]
         faulty = min(lacking_it, key=len, default=numbers)
         whole = len(faulty) == len(numbers)
         faults: dict[int, RewardError] = {}
         for number in numbers[:1] if whole else faulty:
-            own = {name: reasons[number] for name, reasons in self._pictures.items() if reasons[number]}
-            got = "; ".join(f"{name}: {reason}" for name, reason in (left_out if whole else own).items())
-            got = got or f"{self._forms[number]}: {self._layout.without_pictures}"
+            demo = self._demos[number]
+            own = {name: fault for name in self._pictures if (fault := demo.fault(name))}
+            got = "; ".join(map(": ".join, (left_out if whole else own).items()))
+            got = got or f"{_described(demo.forms)}: {self._layout.without_pictures}"
             expected = "a camera as uint8 [T, H, W, 3]" + " in every demonstration" * whole
-            where = f"{self.file}: {self._layout.cameras_at(self._demos[number])}"
-            faults[number] = DatasetError.at(where, expected, got)
+            faults[number] = DatasetError.at(f"{self.file}: {self._layout.cameras_at(demo.name)}", expected, got)
         raise faults[numbers[0]] if whole else FaultsError.of(faults, numbers)
 
     def _shared(self, numbers: Sequence[int]) -> tuple[Sequence[str], Mapping[str, str]]:
         """The cameras that all these demonstrations share, and what is wrong with other pictures."""
-        chosen = {name: [faults[number] for number in numbers] for name, faults in self._pictures.items()}
-        faults = {name: next(filter(None, of_demos), "") for name, of_demos in chosen.items()}
+        demos = [self._demos[number] for number in numbers]
+        faults = {name: next(filter(None, (demo.fault(name) for demo in demos)), "") for name in self._pictures}
         cameras = tuple(name for name, fault in faults.items() if not fault)
         return cameras, {name: fault for name, fault in faults.items() if fault}
 
-    def _cameras_of(self, number: int) -> list[str]:
-        return [name for name, faults in self._pictures.items() if not faults[number]]
-
     def decoder(self, camera: str) -> str | None:
-        return Picture.decoder() if camera in self._firsts else None
+        return Picture.decoder() if camera in self._marks else None
 
-    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+    def identity(self, episode: DatasetEpisode, camera: str) -> str:
         with opened_hdf5(self.file) as opened:
-            encoded = self._encoded(self._video(opened, episode, camera), episode, camera)
-            if encoded is not None:
+            if encoded := self._encoded(self._video(opened, episode, camera), episode, camera):
                 return digest_of(encoded.files())
         return digest_of(frame.tobytes() for frame in self.stored_frames(episode, camera))
 
@@ -222,14 +258,14 @@ class Hdf5Dataset(Dataset):
                 try:
                     yield from video[start : start + _FRAMES_AT_A_TIME]
                 except OSError as error:
-                    raise DatasetError.at(self._where(episode, camera), "readable frames", error) from error
+                    raise DatasetError.at(self.place(episode, camera), "readable frames", error) from error
 
     def _encoded(self, video: Any, episode: DatasetEpisode, camera: str) -> EncodedFrames | None:
         """The frames as files; None: they are pixels."""
         if not is_encoded(video, self._layout.are_pictures):
             return None
         stored = video[self._layout.skipped :] if self._layout.skipped else video
-        return EncodedFrames(stored, self._where(episode, camera))
+        return EncodedFrames(stored, self.place(episode, camera))
 
     def _video(self, opened: Any, episode: DatasetEpisode, camera: str) -> Any:
         video = opened.get(self._layout.path_of(episode.name, camera))
@@ -237,38 +273,18 @@ class Hdf5Dataset(Dataset):
         num_pictures = episode.num_frames + self._layout.skipped
         is_video = is_whole and len(video) == num_pictures
         got = "none" if video is None else form_of(video)
-        require(self._where(episode, camera), is_video, f"uint8 [{num_pictures}, H, W, 3]", got)
+        require(self.place(episode, camera), is_video, f"uint8 [{num_pictures}, H, W, 3]", got)
         return video
 
-    def _where(self, episode: DatasetEpisode, camera: str) -> str:
+    def place(self, episode: DatasetEpisode, camera: str) -> str:
         return f"{self.file}: {self._layout.path_of(episode.name, camera)}"
 
 
-def _one_length(lengths: Mapping[str, int]) -> int:
-    """The frame count, equal in all cameras; 0 if cameras differ or there are none.
-
-    The action count must be the same, or one less if the last observation has no action; otherwise 0.
-    """
-    of_cameras = {length for key, length in lengths.items() if key != _ACTIONS}
-    length = of_cameras.pop() if len(of_cameras) == 1 else 0
-    return length if lengths.get(_ACTIONS, length) in (length, length - 1) else 0
+def _described(forms: Mapping[str, str]) -> str:
+    return ", ".join(map(" ".join, forms.items())) or "none"
 
 
-def _notes_on_samples(
-    demos: Mapping[int, tuple[str, Any]], lengths: Mapping[int, Mapping[str, int]], skipped: int
-) -> list[str]:
-    """Return a note on demonstrations whose ``num_samples`` contradicts their frames; empty if there are none."""
-    differing = []
-    for number, (name, demo) in demos.items():
-        length = _one_length(lengths[number])
-        count = attribute(demo.attrs, "num_samples") if length else None
-        if count is not None and count - skipped not in lengths[number].values():
-            differing.append(f"{name} ({count}, has {length})")
-    every = "each observation gets a label"
-    return [f"lengths: num_samples differs: {first_names(differing)}: {every}"] if differing else []
-
-
-def _notes(uncorrected: Sequence[str], is_libero: bool) -> Sequence[str]:
+def _notes(uncorrected: Sequence[str], is_libero: bool) -> list[str]:
     if is_libero and uncorrected:
         why = "LIBERO stores its pictures upside down; --orient none leaves them"
         return [f"orient: {', '.join(uncorrected)} {_LIBERO} ({why})"]

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
 """HDF5 layouts: where an episode keeps pictures, actions and task. Needs h5py.
 
-Episodes look the same to the reader in every layout: ``{"obs": {camera: array}, "actions": array}`` with ``attrs``.
+A ``Layout`` lists the paths; the reader does not know the layouts.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,6 @@ from rfm_client.options import first_names
 from rfm_labels.datasets.faults import DatasetError, require, unreadable
 
 DOCUMENTS = ("problem_info", "env_args")  # attributes of ``data`` that hold a JSON object
-_DEMO = re.compile(r"demo_(\d+)")
 _SENTENCES = ("language_instruction", "language", "lang")  # keys for the task in problem_info and env_args
 _DEFAULT_FPS = 20.0  # robosuite's
 _TRAJECTORY = re.compile(r"traj_(\d+)")
@@ -50,58 +49,21 @@ def opened_hdf5(file: Path) -> Iterator[Any]:
             raise DatasetError.at(file, "an undamaged HDF5 file", error) from error
 
 
-def demonstrations(file: Path, opened: Any) -> dict[int, tuple[str, Any]]:
-    """Return demonstration names and groups by number; None for a group that cannot be opened.
-
-    Raises DatasetError if there is no demonstration, or two share a number.
-    """
-    group = opened.get("data")
-    members = members_of(group)
-    demos: dict[int, tuple[str, Any]] = {}
-    for name, content in members.items():
-        if match := _DEMO.fullmatch(name):
-            number = int(match[1])
-            got = f"{demos.get(number, ('', None))[0]} and {name}: rename one of them"
-            require(f"{file}: data", number not in demos, "one demonstration of each number", got)
-            demos[number] = name, content
-    got = first_names(members) or f"none: the file holds {first_names(members_of(opened)) or 'nothing'}"
-    require(f"{file}: data", bool(demos), "demo_0, demo_1 and so on", got)
-    return dict(sorted(demos.items()))
-
-
 def members_of(group: Any) -> Mapping[str, Any]:
     """Return a group's members by name, None for a member that cannot be opened; empty if it is not a group."""
     members = group.items() if hasattr(group, "keys") else ()
     return {name.decode(errors="replace") if isinstance(name, bytes) else name: member for name, member in members}
 
 
-def filter_keys(opened: Any, names: Mapping[int, str]) -> tuple[Mapping[str, Sequence[int]], Sequence[str]]:
-    """Return the demonstration numbers in each ``mask`` dataset, and a note on each dataset with other contents.
-
-    names: demonstration names by number
-    """
-    group, numbers = opened.get("mask"), {name: number for number, name in names.items()}
+def filter_keys(opened: Any) -> Mapping[str, Sequence[int]]:
+    """Return the demonstration numbers in each ``mask`` dataset with names of demonstrations."""
     found: dict[str, Sequence[int]] = {}
-    notes = ["left out: mask: expected a group"] if "mask" in opened and not hasattr(group, "keys") else []
-    for key, stored in members_of(group).items():
+    for key, stored in members_of(opened.get("mask")).items():
         texts = texts_in(stored)
-        known = [numbers.get(name, _missing_number(name, names)) for name in texts or ()]
-        if texts is not None and None not in known:
-            found[key] = sorted(number for number in known if number is not None)
-        else:
-            others = [name for name, number in zip(texts or (), known, strict=True) if number is None]
-            notes.append(
-                f"left out: mask/{key}: expected names of demonstrations, got {first_names(others) or 'no text'}"
-            )
-    return found, notes
-
-
-def unread(opened: Any, names: Iterable[str]) -> list[str]:
-    """Return a line that lists all unread groups; empty if there are none. names: demonstrations."""
-    read = set(names)
-    others = [f"data/{name}" for name in members_of(opened["data"]) if name not in read]
-    others += [name for name in members_of(opened) if name not in ("data", "mask")]
-    return [f"left out: {first_names(others)}: demonstrations are data/demo_<number>"] if others else []
+        names = [re.fullmatch(r"demo_(\d+)", text) for text in texts or ()]
+        if texts is not None and None not in names:
+            found[key] = sorted({int(name[1]) for name in names if name})
+    return found
 
 
 def texts_in(stored: Any) -> list[str] | None:
@@ -113,26 +75,6 @@ def texts_in(stored: Any) -> list[str] | None:
     except (OSError, RuntimeError, TypeError, ValueError):
         return None
     return [value.decode(errors="replace") if isinstance(value, bytes) else str(value) for value in values]
-
-
-def _missing_number(name: str, names: Mapping[int, str]) -> int | None:
-    """The number of a demonstration missing from the file; None for another name."""
-    match = _DEMO.fullmatch(name)
-    return int(match[1]) if match and int(match[1]) not in names else None
-
-
-def own_task_of(demo: Any) -> Any:
-    """Read a demonstration's task from ``ep_meta``, as robomimic does, or from an attribute; None without one."""
-    attributes = getattr(demo, "attrs", {})
-    stored = document(attributes, "ep_meta")
-    own = next((stored[key] for key in _SENTENCES if stored.get(key)), None)
-    return own or next((attribute(attributes, key) for key in _SENTENCES if key in attributes), None)
-
-
-def task_of(attributes: Mapping[str, Any]) -> Any:
-    """Read the task for all demonstrations from the attributes on ``data``; None if there is none."""
-    documents = (document(attributes, name) for name in DOCUMENTS)
-    return next((found[key] for found in documents for key in _SENTENCES if found.get(key)), None)
 
 
 def is_of_libero(attributes: Mapping[str, Any]) -> bool:
@@ -224,31 +166,44 @@ class Layout:
         return self.path_of(demo, "{camera}").partition("{camera}")[0].rstrip("/")
 
     def episodes(self, file: Path, opened: Any) -> dict[int, tuple[str, Any]]:
-        """Return each episode's name and content by number; None for a group that cannot be opened.
+        """Return each episode's name and group by number; None for a group that cannot be opened.
 
-        Raises DatasetError.
+        Raises DatasetError if there is none, or two share a number.
         """
-        if self.is_in_data:
-            demos = demonstrations(file, opened)
-            if self is ROBOMIMIC:
-                return demos
-            return {n: (name, None if demo is None else self._episode(demo)) for n, (name, demo) in demos.items()}
-        found = {0: opened} if not self.group else _trajectories(file, opened)
-        return {n: (f"demo_{n}", None if group is None else self._episode(group)) for n, group in sorted(found.items())}
+        above, _, pattern = self.group.rpartition("/")
+        if not pattern:
+            return {0: ("demo_0", opened)}
+        name_of, members = re.compile(pattern.format(demo=r"demo_(\d+)", number=r"(\d+)")), members_of(opened)
+        members = members_of(members.get(above)) if above else members
+        found: dict[int, tuple[str, Any]] = {}
+        where, got = f"{file}: {above}".removesuffix(": "), first_names(members)
+        for name, group in members.items():
+            if match := name_of.fullmatch(name):
+                number = int(match[1])
+                twice = f"{found.get(number, ('', None))[0]} and {name}: rename one of them"
+                require(where, number not in found, "one demonstration of each number", twice)
+                found[number] = name, group
+        got = got or f"none: the file holds {first_names(members_of(opened)) or 'nothing'}"
+        require(where, bool(found), "demo_0, demo_1 and so on", got)
+        return {
+            number: (f"demo_{number}" if not above else name, group) for number, (name, group) in sorted(found.items())
+        }
 
-    def _episode(self, group: Any) -> _Episode:
+    def observations(self, group: Any) -> dict[str, Any]:
+        """Return an episode's observations by name; None for one that cannot be opened or that NumPy does not know."""
         above, _, below = self.pictures.partition("{camera}")
-        found = members_of(group.get(above.rstrip("/")))
-        if below:
-            below = below.lstrip("/")
+        found = members_of(group.get(above.rstrip("/")) if hasattr(group, "keys") else None)
+        if below := below.lstrip("/"):
             found = {name: each.get(below) for name, each in found.items() if hasattr(each, "keys") and below in each}
-        episode = _Episode(obs=found, actions=group.get(self.actions) if self.actions else None)
-        episode.attrs = group.attrs
-        return episode
+        return {name: value if _is_known(value) else None for name, value in found.items()}
 
 
-class _Episode(dict[str, Any]):
-    attrs: Mapping[str, Any]
+def _is_known(value: Any) -> bool:
+    """True for a group, or an array with numbers or texts that NumPy knows."""
+    try:
+        return hasattr(value, "keys") or (getattr(value, "shape", None) is not None and bool(value.dtype.kind))
+    except (TypeError, OSError, RuntimeError):
+        return False
 
 
 _AS_STORED = "read as JPEG files say; some recorders store blue in the place of red"
@@ -320,27 +275,30 @@ def layout_of(opened: Any) -> Layout:
     return _MANISKILL if "data" not in opened and any(map(_TRAJECTORY.fullmatch, opened)) else ROBOMIMIC
 
 
-def _trajectories(file: Path, opened: Any) -> dict[int, Any]:
-    found: dict[int, Any] = {}
-    for name, group in members_of(opened).items():
-        if match := _TRAJECTORY.fullmatch(name):
-            if int(match[1]) in found:
-                raise DatasetError.at(file, "one trajectory of each number", f"{name} again: rename one of them")
-            found[int(match[1])] = group
-    return found
-
-
-def task_places(file: Path) -> str:
-    """Return where ``task_in`` looks, for messages."""
+def task_places(file: Path, layout: Layout, broken: Sequence[str]) -> str:
+    """Return where ``task_of`` looks, for messages. broken: as ``unread_documents`` names them"""
+    if layout.is_in_data:
+        documents = [name + " (no JSON object)" * (name in broken) for name in DOCUMENTS]
+        return f"ep_meta, or data: {' or '.join(documents)}"
     return f"attribute or dataset {', '.join(_TASK_NAMES)}, or RoboTwin's instructions/{file.stem}.json"
 
 
-def task_in(file: Path, opened: Any, episode: Any) -> Any:
-    """Read an episode's task from attributes, a dataset, or RoboTwin's side file; None without one."""
-    found = own_task_of(episode)
+def task_of(file: Path, opened: Any, episode: Any, layout: Layout) -> Any:
+    """Read an episode's task; None without one.
+
+    First from its attributes, as robomimic does (``ep_meta``); then from those of ``data``, or for an episode outside
+    of ``data`` from other attributes, a dataset, or RoboTwin's side file.
+    """
+    attributes = getattr(episode, "attrs", {})
+    stored = document(attributes, "ep_meta")
+    found = next((stored[key] for key in _SENTENCES if stored.get(key)), None)
+    found = found or next((attribute(attributes, key) for key in _SENTENCES if key in attributes), None)
+    if layout.is_in_data:
+        documents = [document(opened["data"].attrs, name) for name in DOCUMENTS]
+        return found or next((each[key] for each in documents for key in _SENTENCES if each.get(key)), None)
     for name in _TASK_NAMES:
-        found = found or attribute(getattr(episode, "attrs", {}), name) or _one(texts_in(opened.get(name)))
-    return found or next(iter(instructions_of(file) if layout_of(opened) is ROBOTWIN else ()), None)
+        found = found or attribute(attributes, name) or _one(texts_in(opened.get(name)))
+    return found or next(iter(instructions_of(file) if layout is ROBOTWIN else ()), None)
 
 
 def _one(texts: list[str] | None) -> Any:

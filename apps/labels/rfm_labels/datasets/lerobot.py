@@ -29,7 +29,16 @@ from rfm_labels.datasets.lerobot_meta import (
     read_table,
 )
 from rfm_labels.datasets.lerobot_rows import TASK_COLUMN, RowReader, Sentences, has_numbers, read_sentences, table_of
-from rfm_labels.datasets.stored_files import Span, Times, digest_of, faults_at, file_identity, turn_mark
+from rfm_labels.datasets.stored_files import (
+    Span,
+    Times,
+    check_pictures,
+    digest_of,
+    faults_at,
+    file_identity,
+    picture_frames,
+    turn_mark,
+)
 
 _VIDEOS_AT_A_TIME = 4  # packets of this many videos, or one per camera, stay in memory
 _CONTAINER = {".mp4": "mov"}  # FFmpeg's names by suffix. Otherwise FFmpeg would open the files that a playlist names
@@ -120,28 +129,23 @@ class LeRobotDataset(Dataset):
     def decoder(self, camera: str) -> str | None:
         return Video.decoder() if camera in self.info.videos else Picture.decoder()
 
-    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+    def identity(self, episode: DatasetEpisode, camera: str) -> str:
         if camera not in self.info.videos:
             return digest_of(image + turn_mark(image).encode() for image in self._images(episode, camera))
         video, from_s = self._entry(episode.index).video(camera)
         clock = self._clocks[episode.index]
-        return f"{file_identity(video, verify=verify, revision=self.revision)} {from_s}{clock}"
+        return f"{file_identity(video, self.revision)} {from_s}{clock}"
 
     def check(self, episode: DatasetEpisode, camera: str) -> None:
         if camera in self.info.videos:
             self._frames_of(episode, camera)
-            return
-        for t, image in enumerate(self._images(episode, camera)):
-            with faults_at(_where(episode, camera, t)):
-                Picture(image).check()
+        else:
+            check_pictures(self._images(episode, camera), self.place(episode, camera))
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         if camera in self.info.videos:
-            yield from self.span(episode, camera).frames()
-            return
-        for t, image in enumerate(self._images(episode, camera)):
-            with faults_at(_where(episode, camera, t)):
-                yield Picture(image).pixels()
+            return self.span(episode, camera).frames()
+        return picture_frames(self._images(episode, camera), self.place(episode, camera))
 
     def times_s(self, episode: DatasetEpisode) -> Times:
         """Return frame times from the episode's start, float64 [T]. Raises DatasetError."""
@@ -151,7 +155,7 @@ class LeRobotDataset(Dataset):
         """Return the episode's frames in the camera's video. Raises DatasetError if a row has no frame of its own."""
         rows, frames = self._frames_of(episode, camera)
         tolerance_s = 0.5 * rows.apart_s(frames)
-        return Span(rows.video, rows.video.packets.times_s[frames], tolerance_s, f"{episode.name}: {camera}")
+        return Span(rows.video, rows.video.packets.times_s[frames], tolerance_s, self.place(episode, camera))
 
     def _entry(self, number: int) -> Entry:
         entry = self._entries[number]
@@ -192,7 +196,7 @@ class LeRobotDataset(Dataset):
         file = self._rows.file_of(self._entry(episode.index))
         stored = read_table(file, [camera], filters=[("episode_index", "=", episode.index)])[camera].to_pylist()
         require(f"{file}: {camera}", len(stored) == episode.num_frames, f"{episode.num_frames} images", len(stored))
-        return [self._image_bytes(_where(episode, camera, t), image) for t, image in enumerate(stored)]
+        return [self._image_bytes(f"{self.place(episode, camera)}: frame {t}", image) for t, image in enumerate(stored)]
 
     def _image_bytes(self, where: str, image: Any) -> bytes:
         image = image if isinstance(image, dict) else {}
@@ -205,7 +209,3 @@ class LeRobotDataset(Dataset):
             return (self.root / path).read_bytes()
         except OSError as error:
             raise DatasetError.at(where, "an image file", f"{error.strerror} ({path})") from error
-
-
-def _where(episode: DatasetEpisode, camera: str, t: int) -> str:
-    return f"{episode.name}: {camera}: frame {t}"

@@ -105,13 +105,9 @@ class VideoRows:
         return DatasetError.at(where, f"its frame at {expected_s:.4f} s", got)
 
     def _other_row(self, match: _Match, k: int) -> str:
+        rows = [f"{part.where}, row {t}" for part in self.parts for t in range(len(part.times_s))]
         same = np.flatnonzero((match.frames == match.frames[k]) & ~match.is_far)
-        other = int(same[same != k][0])
-        for part in self.parts:
-            if other < len(part.times_s):
-                return f"{part.where}, row {other}"
-            other -= len(part.times_s)
-        raise AssertionError("a row of no part")
+        return rows[int(same[same != k][0])]
 
     @property
     def _rates(self) -> str:

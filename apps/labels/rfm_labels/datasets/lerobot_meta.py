@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rfm_client.options import checked_count
-from rfm_labels.datasets.faults import DatasetError, require, unreadable
+from rfm_labels.datasets.faults import DatasetError, json_object, require, unreadable
 
 INFO_FILE = Path("meta", "info.json")
 VERSIONS = ("v2.0", "v2.1", "v3.0")
@@ -62,11 +62,7 @@ class Info:
     def read(cls, root: Path) -> Info:
         """Read the information in ``root``. Raises DatasetError."""
         file = root / INFO_FILE
-        try:
-            document = json.loads(file.read_bytes())
-        except (OSError, ValueError, RecursionError) as error:
-            raise DatasetError.at(file, "a readable JSON file", error) from error
-        require(file, isinstance(document, dict), "a JSON object", type(document).__name__)
+        document = json_object(file)
         notes: list[str] = []
         if "codebase_version" not in document:
             document["codebase_version"] = version = "v3.0" if (root / EPISODES_FOLDER).is_dir() else "v2.1"
@@ -188,14 +184,11 @@ def column_types(file: Path) -> Mapping[str, str]:
 
 def read_entries(info: Info) -> Iterator[tuple[int, Entry | DatasetError]]:
     """Yield each episode's number with its metadata or fault. Raises DatasetError."""
-    return _entries_v30(info) if info.version == "v3.0" else _entries_v21(info)
-
-
-def _entries_v21(info: Info) -> Iterator[tuple[int, Entry | DatasetError]]:
-    for where, line in json_lines(info.root / EPISODES_FILE):
-        index = number_in(where, line, "episode_index")
+    is_v30 = info.version == "v3.0"
+    for where, row in _rows_v30(info) if is_v30 else json_lines(info.root / EPISODES_FILE):
+        index = number_in(where, row, "episode_index")
         try:
-            yield index, _entry_v21(info, where, index, line)
+            yield index, (_entry_v30 if is_v30 else _entry_v21)(info, where, index, row)
         except DatasetError as error:
             yield index, error
 
@@ -213,23 +206,18 @@ def _entry_v21(info: Info, where: str, index: int, line: Mapping[str, Any]) -> E
     )
 
 
-def _entries_v30(info: Info) -> Iterator[tuple[int, Entry | DatasetError]]:
+def _rows_v30(info: Info) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """The rows in all files, each after its file for messages."""
     files = sorted((info.root / EPISODES_FOLDER).rglob("*.parquet"))
     require(info.root / EPISODES_FOLDER, bool(files), "Parquet files", "none")
     of_videos = [f"videos/{key}/{name}" for key in info.videos for name in _VIDEO_COLUMNS]
     for file in files:
         for row in read_table(file, [*_EPISODE_COLUMNS, *of_videos]).to_pylist():
-            index = row["episode_index"]
-            require(f"{file}: episode_index", index is not None, "a value", "none")
-            try:
-                yield index, _entry_v30(info, file, row)
-            except DatasetError as error:
-                yield index, error
+            yield str(file), row
 
 
-def _entry_v30(info: Info, file: Path, row: dict[str, Any]) -> Entry:
-    index, length = row["episode_index"], row["length"]
-    where = f"episode {index}: {file}"
+def _entry_v30(info: Info, where: str, index: int, row: Mapping[str, Any]) -> Entry:
+    where, length = f"episode {index}: {where}", row["length"]
     for name in _EPISODE_COLUMNS:
         require(f"{where}: {name}", row[name] is not None, "a value", "none")
     first, end = row["dataset_from_index"], row["dataset_to_index"]
@@ -245,7 +233,7 @@ def _entry_v30(info: Info, file: Path, row: dict[str, Any]) -> Entry:
     )
 
 
-def _video(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float] | DatasetError:
+def _video(info: Info, where: str, row: Mapping[str, Any], key: str) -> tuple[Path, float] | DatasetError:
     """A camera's video and the episode's start in it, or a fault, which counts only if the camera is used."""
     names = [f"videos/{key}/{name}" for name in _VIDEO_COLUMNS]
     try:
@@ -257,7 +245,7 @@ def _video(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path,
         return error
 
 
-def _place(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float]:
+def _place(info: Info, where: str, row: Mapping[str, Any], key: str) -> tuple[Path, float]:
     chunk, number, from_s, to_s = (row[f"videos/{key}/{name}"] for name in _VIDEO_COLUMNS)
     lasts_s, expected_s = to_s - from_s, row["length"] / info.fps
     is_long_enough = lasts_s >= expected_s - 0.5 / info.fps  # longer: includes frames from a discarded take

@@ -11,9 +11,9 @@ import csv
 import io
 import os
 import re
-from collections.abc import Collection, Iterator, Mapping, Set
+from collections.abc import Collection, Mapping
 from pathlib import Path, PurePath
-from typing import Any, TypeAlias
+from typing import Any
 
 from rfm_client.frames import ARRAY_SUFFIXES, ChannelOrder, Orientation, cached_snapshot
 from rfm_client.options import first_names
@@ -22,7 +22,6 @@ from rfm_labels.datasets.faults import DatasetError, FaultsError, require, short
 from rfm_labels.datasets.folders import (
     PICTURE_SUFFIXES,
     ArrayFiles,
-    Contents,
     EpisodeFiles,
     FrameFolders,
     UnitreeFolders,
@@ -43,7 +42,6 @@ from rfm_labels.datasets.rlds_files import FEATURES_FILE
 TABLE = "tasks.csv"
 _NAMES = ("video", "episode")  # column names for the path
 _DELIMITERS = ",;\t"
-_Line: TypeAlias = tuple[str, str, str | None]  # place, path and task
 _HUB_ID = re.compile(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")
 _LAYOUTS = (
     f"a LeRobot dataset ({INFO_FILE}), an RLDS dataset ({FEATURES_FILE}), an HDF5 file ({', '.join(SUFFIXES)}), a "
@@ -61,13 +59,14 @@ _UNREAD = {  # remedies for layouts without a reader, by file name pattern
     r".*\.(bag|mcap|db3)": f"a rosbag: {_CONVERT}",
 }
 _VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov", ".webm", ".avi")
-_SUFFIXES = {"videos": _VIDEO_SUFFIXES, "arrays": ARRAY_SUFFIXES}  # for episodes that are files
+_SUFFIXES = {"videos": _VIDEO_SUFFIXES, "arrays": ARRAY_SUFFIXES, "HDF5 files": SUFFIXES, "pictures": PICTURE_SUFFIXES}
 _KINDS: dict[str, tuple[type[EpisodeFiles], str]] = {  # reader, and what an episode is called
     "videos": (VideoFolder, "video"),
     "folders of pictures": (FrameFolders, "folder"),
     "arrays": (ArrayFiles, "file"),
     "recordings of Unitree": (UnitreeFolders, "folder"),
 }
+_ORDER = ("videos", "arrays", "HDF5 files", "recordings of Unitree", "folders of pictures", "pictures")
 _OWN_TASKS = ("arrays", "recordings of Unitree")
 _OUR_FILES = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside labelled episodes; HDF5: from 0.4
 
@@ -81,18 +80,33 @@ def read_table_of_tasks(table: Path, *, has_tasks: bool) -> Mapping[str, str | N
         text = table.read_text(encoding="utf-8-sig")  # spreadsheets put a byte order mark first
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError.at(table, "a readable table of tasks", error) from error
-    faults: list[str] = []
-    name, lines = _from_csv(table, text, has_tasks, faults)
-    tasks: dict[str, str | None] = {}
-    for where, path, task in lines:
-        if not path.strip():
-            faults.append(f"{where}: expected the path of a {name}, got none")
-        elif (known := _normal(table.parent, path)) in tasks:
-            faults.append(f"{where}: expected each {name} once, got {path}")
-        else:
-            tasks[known] = task
+    header, faults, tasks = text.partition("\n")[0], list[str](), dict[str, str | None]()
+    delimiter = next((each for each in _DELIMITERS if each in header), _DELIMITERS[0])
+    rows = csv.reader(io.StringIO(text), delimiter=delimiter, skipinitialspace=True, strict=True)
+    try:
+        columns = [cell.strip().lower() for cell in next(rows, [])]
+        name = next((column for column in _NAMES if column in columns), _NAMES[0])
+        is_whole = name in columns and ("task" in columns or not has_tasks)
+        got = f"{', '.join(columns) or 'none'} (--task stands for the column task)"
+        require(table, is_whole, f"the columns {name} and task", got)
+        for row in rows:
+            where, cells = f"{table}: line {rows.line_num}", dict(zip(columns, row, strict=False))
+            if not any(map(str.strip, row)):
+                continue
+            if len(row) != len(columns):
+                expected = f"{len(columns)} cells (text with a comma in quotes)"
+                faults.append(f"{where}: expected {expected}, got {len(row)}")
+            elif not cells[name].strip():
+                faults.append(f"{where}: expected the path of a {name}, got none")
+            elif (path := _normal(table.parent, cells[name])) in tasks:
+                faults.append(f"{where}: expected each {name} once, got {cells[name]}")
+            else:
+                tasks[path] = cells.get("task")
+    except csv.Error as error:
+        where = f"{table}: line {rows.line_num}"
+        raise DatasetError.at(where, 'quotes around a whole cell, and "" for a quote in it', error) from error
     if faults:
-        raise FaultsError.listing(shortened(faults))
+        raise FaultsError("\n".join(shortened(faults)))
     require(table, bool(tasks), "at least one video", "none")
     return tasks
 
@@ -103,43 +117,6 @@ def _normal(root: Path, path: str) -> str:
     if "\\" in path and not (root / path).exists():
         path = path.replace("\\", "/")
     return PurePath(os.path.normpath(path)).as_posix()
-
-
-def _from_csv(table: Path, text: str, has_tasks: bool, faults: list[str]) -> tuple[str, Iterator[_Line]]:
-    """The path column's name, and the lines."""
-    first, _, _ = text.partition("\n")
-    delimiter = next((each for each in _DELIMITERS if not set(_header(first, each)).isdisjoint(_NAMES)), ",")
-    columns = _header(first, delimiter)
-    name = next((column for column in _NAMES if column in columns), _NAMES[0])
-    required: Set[str] = {name, "task"} if has_tasks else {name}
-    got = f"{', '.join(columns) or 'none'} (--task stands for the column task)"
-    require(table, not required - set(columns), f"the columns {name} and task", got)
-    return name, _lines(table, text, delimiter, columns, name, faults)
-
-
-def _header(line: str, delimiter: str) -> list[str]:
-    return [cell.strip().lower() for cell in next(csv.reader([line], delimiter=delimiter), [])]
-
-
-def _lines(table: Path, text: str, delimiter: str, columns: list[str], name: str, faults: list[str]) -> Iterator[_Line]:
-    """The lines below the header. Lines with a wrong cell count go to ``faults`` instead."""
-    has_blanks = re.search(f'{delimiter} +"', text) is not None  # else a quote after spaces would be part of the text
-    rows = csv.reader(io.StringIO(text), delimiter=delimiter, skipinitialspace=has_blanks, strict=True)
-    try:
-        next(rows)
-        for row in rows:
-            where = f"{table}: line {rows.line_num}"
-            if not any(map(str.strip, row)):
-                continue
-            if len(row) != len(columns):
-                expected = f"{len(columns)} cells (text with a comma in quotes)"
-                faults.append(f"{where}: expected {expected}, got {len(row)}")
-                continue
-            cells = dict(zip(columns, row, strict=True))
-            yield where, cells[name], cells.get("task")
-    except csv.Error as error:
-        where = f"{table}: line {rows.line_num}"
-        raise DatasetError.at(where, 'quotes around a whole cell, and "" for a quote in it', error) from error
 
 
 def open_dataset(
@@ -239,11 +216,12 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
     if table.is_file():
         tasks = read_table_of_tasks(table, has_tasks=task.text is None)
         there = [name for name in tasks if (table.parent / name).exists()] or list(tasks)
-        kinds = {_kind_of(table.parent / name): name for name in reversed(there)}
+        found = {_kind_of(table.parent / name): name for name in reversed(there)}
+        kinds = {kind if kind in _KINDS else "videos": name for kind, name in found.items()}
         examples = " and ".join(f"{kind} ({name})" for kind, name in sorted(kinds.items()))
         require(table, len(kinds) == 1, "episodes of one kind", f"{examples}: write a table for each kind")
         (kind,) = kinds
-        dataset = _KINDS[kind][0](Contents(table.parent, tasks, table, task, corrections))
+        dataset = _KINDS[kind][0](table.parent, tasks, table, task, corrections)
         dataset.notes = [*dataset.notes, *_unlisted(table, kind, tasks)]
         return dataset
     require(path, path.is_dir(), _LAYOUTS, "neither")
@@ -254,12 +232,12 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
     require(path, not old_table.is_file(), expected, got)
     got = f"none: write it, or, if all of them have one task, give it: {_GIVE_TASK}"
     require(path, task.text is not None or kind in _OWN_TASKS, expected, got)
-    return reader(Contents(path, dict.fromkeys(names), path, task, corrections))
+    return reader(path, dict.fromkeys(names), path, task, corrections)
 
 
 def _unlisted(table: Path, kind: str, names: Collection[str]) -> list[str]:
     """A note on episodes that lie beside the table's but are not listed; empty if there are none."""
-    names = {str(Path(name).parent) if is_pattern(Path(name)) else name for name in names}
+    names = {str(Path(name).parent) if is_pattern(table.parent / name) else name for name in names}
     beside = {table.parent, *((table.parent / name).parent for name in names)} if kind in _SUFFIXES else {table.parent}
     found = [folder / name for folder in sorted(beside) if folder.is_dir() for name in _found(folder).get(kind, ())]
     if kind == "folders of pictures":  # ``_found`` also has folders without pictures
@@ -269,10 +247,11 @@ def _unlisted(table: Path, kind: str, names: Collection[str]) -> list[str]:
     return [note] if gone else []
 
 
-def _kind_of(path: Path) -> str:
+def _kind_of(path: Path) -> str | None:
+    """What an episode's file or folder is, by name; None: another file."""
     if path.is_dir() or is_pattern(path):
         return "recordings of Unitree" if is_of_unitree(path) else "folders of pictures"
-    return "arrays" if path.suffix.lower() in ARRAY_SUFFIXES else "videos"
+    return next((kind for kind, suffixes in _SUFFIXES.items() if path.suffix.lower() in suffixes), None)
 
 
 def _listed(folder: Path) -> tuple[str, list[str]]:
@@ -289,26 +268,15 @@ def _listed(folder: Path) -> tuple[str, list[str]]:
 
 def _found(folder: Path) -> dict[str, list[str]]:
     """Names that may be episodes, by kind, without hidden files and label files."""
-    shown = [folder / name for name in _names_in(folder)]
-    files = [each for each in shown if each.is_file() and not _OUR_FILES.fullmatch(each.name)]
-    folders = [each for each in shown if each.is_dir() and each.name != SIGNALS_FOLDER]
-    found = {
-        kind: [each.name for each in files if each.suffix.lower() in suffixes]
-        for kind, suffixes in (*_SUFFIXES.items(), ("HDF5 files", SUFFIXES))
-    }
-    of_unitree = [each for each in folders if is_of_unitree(each)]
-    folders = [each for each in folders if each not in of_unitree]
-    found["recordings of Unitree"] = [each.name for each in of_unitree]
-    has_frames = any(_is_frame(file) for each in folders for file in each.iterdir())
-    found["folders of pictures"] = [each.name for each in folders] if has_frames else []
-    if has_frames or not any(found.values()):  # elsewhere a picture is no frame
-        found["pictures"] = [each.name for each in files if _is_frame(each)]
-    return {kind: in_natural_order(names) for kind, names in found.items() if names}
-
-
-def _is_visible(file: Path) -> bool:
-    """True for a file, but not for a hidden one, as macOS adds."""
-    return file.is_file() and not file.name.startswith(".")
+    names = [name for name in in_natural_order(_names_in(folder)) if name != SIGNALS_FOLDER]
+    kinds = {name: _kind_of(folder / name) for name in names if not _OUR_FILES.fullmatch(name)}
+    found = {kind: [name for name in kinds if kinds[name] == kind] for kind in _ORDER}
+    folders = [folder / name for name in found["folders of pictures"]]
+    if not any(_is_frame(file) for each in folders for file in each.iterdir()):
+        found["folders of pictures"] = []
+        if any(found[kind] for kind in found if kind != "pictures"):  # a picture beside other episodes is no frame
+            found["pictures"] = []
+    return {kind: names for kind, names in found.items() if names}
 
 
 def _is_frame(file: Path) -> bool:
@@ -335,7 +303,8 @@ def _unread(path: Path) -> str | None:
     if any(_is_frame(file) for file in path.iterdir()):
         return "pictures outside of the folder of an episode"
     suffixes = {**dict.fromkeys(_VIDEO_SUFFIXES, "videos"), **dict.fromkeys(PICTURE_SUFFIXES, "pictures")}
-    deeper = next((file for file in path.rglob("*") if file.suffix.lower() in suffixes and _is_visible(file)), None)
+    shown = (file for file in path.rglob("*") if file.is_file() and not file.name.startswith("."))
+    deeper = next((file for file in shown if file.suffix.lower() in suffixes), None)
     if deeper is None:
         return None
     kind = suffixes[deeper.suffix.lower()]

@@ -16,7 +16,7 @@ from typing import Any
 from rfm_client import RewardError, UInt8Array
 from rfm_client.frames import BlankFrames, FrameFileError, Picture
 from rfm_client.options import is_blank
-from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
+from rfm_labels.datasets.dataset import AskedCorrections, CountedDataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.datasets.rlds_files import (
     FEATURES_FILE,
@@ -26,7 +26,7 @@ from rfm_labels.datasets.rlds_files import (
     check_packages,
     features_of,
 )
-from rfm_labels.datasets.stored_files import digest_of, faults_at
+from rfm_labels.datasets.stored_files import check_pictures, digest_of, picture_frames
 
 
 def rlds_folder(path: Path) -> Path | None:
@@ -66,12 +66,8 @@ class _Record:
     pictures: Mapping[str, _Pictures]
 
 
-class RldsDataset(Dataset):
-    """The episodes in all splits.
-
-    task: task from the caller
-    corrections: corrections from the caller
-    """
+class RldsDataset(CountedDataset):
+    """The episodes in all splits."""
 
     kind = "RLDS"
 
@@ -84,29 +80,29 @@ class RldsDataset(Dataset):
         self.source, self.given_task, self.notes = info.source, task, info.notes
         self.cameras, self.left_out = tuple(info.cameras), info.left_out
         self.corrections = corrections.of_cameras(self.cameras)
-        files = [RecordFile(each.file, each.num_episodes) for each in info.shards]
-        counts = [each.num_episodes for each in info.shards]
-        self._places = [(file, n) for file, count in zip(files, counts, strict=True) for n in range(count)]
-        splits = [each.split for each in info.shards for _ in range(each.num_episodes)]
+        self._places: list[tuple[RecordFile, int]] = []
+        self.filter_keys = keys = {split: list[int]() for split, _ in info.files}
+        for split, file in info.files:
+            keys[split] += range(len(self._places), len(self._places) + file.num_records)
+            self._places += [(file, number) for number in range(file.num_records)]
         self.numbers = range(len(self._places))
-        self.filter_keys = {
-            split: [number for number in self.numbers if splits[number] == split] for split in dict.fromkeys(splits)
-        }
         self._records: dict[int, _Record] = {}
-        self._firsts = [0]
+
+    def length(self, number: int) -> int:
+        return self._record(number).num_steps
 
     def read_episode(self, number: int) -> DatasetEpisode:
-        """Read an episode, and count the frames before it; broken episodes count as empty. Raises DatasetError."""
-        record = self._record(number)
-        stretches = self._tasks(number, record)
-        while len(self._firsts) <= number:
-            self._firsts.append(self._firsts[-1] + self._length_or_0(len(self._firsts) - 1))
+        (file, record), length = self._places[number], self.length(number)
+        stretches = self._tasks(number, self._record(number))
         several = tuple(stretches) if len(stretches) > 1 else ()
-        first = self._firsts[number]
-        return DatasetEpisode(number, self._name(number), stretches[0][1], record.num_steps, first, several)
+        name, first = f"{file.file.name}#{record}", self.frames_before(number)
+        return DatasetEpisode(number, name, stretches[0][1], length, first, several)
 
     def cameras_in(self, numbers: Sequence[int]) -> tuple[Sequence[str], Mapping[str, str]]:
-        readable = [record for number in numbers if (record := self._readable(number))]
+        readable = []
+        for number in numbers:
+            with suppress(RewardError):  # raised again if this episode is read
+                readable.append(self._record(number))
         blank: dict[str, str] = {}
         for camera in self.cameras if readable else ():
             descriptions = [record.pictures[camera].blank for record in readable]
@@ -119,7 +115,7 @@ class RldsDataset(Dataset):
     def decoder(self, camera: str) -> str | None:
         return Picture.decoder()
 
-    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+    def identity(self, episode: DatasetEpisode, camera: str) -> str:
         return self._record(episode.index).pictures[camera].digest
 
     def check(self, episode: DatasetEpisode, camera: str) -> None:
@@ -127,13 +123,12 @@ class RldsDataset(Dataset):
         if fault is not None:
             raise fault
 
+    def place(self, episode: DatasetEpisode, camera: str) -> str:
+        return f"{self._where(episode.index)}: {camera}"
+
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        where = f"{self._where(episode.index)}: {camera}"
         stored = self._values(self._features(episode.index), self._info.cameras[camera])
-        require(where, len(stored) == episode.num_frames, f"{episode.num_frames} pictures", len(stored))
-        for t, picture in enumerate(stored):
-            with faults_at(f"{where}: frame {t}"):
-                yield Picture(picture).pixels()
+        return picture_frames(stored, self.place(episode, camera))
 
     def _record(self, number: int) -> _Record:
         """Read a record, cached after the first call. Raises DatasetError."""
@@ -152,17 +147,6 @@ class RldsDataset(Dataset):
             changes = [(t, text) for t, text in enumerate(texts) if t == 0 or text != texts[t - 1]]
             self._records[number] = _Record(num_steps, instruction, changes, pictures)
         return self._records[number]
-
-    def _readable(self, number: int) -> _Record | None:
-        """The record; None for a broken one, which ``read_episode`` refuses."""
-        try:
-            return self._record(number)
-        except RewardError:
-            return None
-
-    def _length_or_0(self, number: int) -> int:
-        record = self._readable(number)
-        return record.num_steps if record else 0
 
     def _instruction(self, features: Mapping[str, Any]) -> str:
         """The first feature with a non-blank instruction; else the first feature, or none."""
@@ -185,24 +169,17 @@ class RldsDataset(Dataset):
     def _values(features: Mapping[str, Any], name: str) -> Sequence[bytes]:
         return features[name].bytes_list.value if name in features else ()
 
-    def _name(self, number: int) -> str:
-        file, record = self._places[number]
-        return f"{file.file.name}#{record}"
-
     def _where(self, number: int) -> str:
         file, record = self._places[number]
         return f"{file.file}: record {record}"
 
 
 def _pictures(where: str, stored: Sequence[bytes]) -> _Pictures:
-    digest = digest_of(stored)
-    for t, picture in enumerate(stored):
-        try:
-            with faults_at(f"{where}: frame {t}"):
-                Picture(picture).check()
-        except DatasetError as fault:
-            return _Pictures(digest, "", fault)
-    blank = ""
+    digest, blank = digest_of(stored), ""
+    try:
+        check_pictures(stored, where)
+    except DatasetError as fault:
+        return _Pictures(digest, blank, fault)
     if all(picture == stored[0] for picture in stored):
         with suppress(FrameFileError):  # raised again by the frames
             blank = BlankFrames([Picture(stored[0]).pixels()]).told

@@ -10,7 +10,6 @@ Format: tensorflow/core/lib/io/record_writer.h and tensorflow/core/example/examp
 
 from __future__ import annotations
 
-import json
 import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,7 +20,7 @@ from typing import Any, BinaryIO
 
 from rfm_client.options import git_lfs_pointer
 from rfm_labels.datasets.dataset import LEAST_SIZE_PX
-from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.datasets.faults import DatasetError, json_object, require
 
 NEEDED = 'RLDS datasets need google-crc32c and protobuf: pip install ./client "./apps/labels[rlds]"'
 _HEAD = struct.Struct("<QI")
@@ -55,7 +54,7 @@ class RecordFile:
 
     def __init__(self, file: Path, num_records: int) -> None:
         self.file = file
-        self._num_records = num_records
+        self.num_records = num_records
         self._starts = [0]  # offsets of the records found so far, and of the next
 
     def record(self, number: int) -> bytes:
@@ -70,7 +69,7 @@ class RecordFile:
                 return self._checked(opened, number, starts[number])
         except FileNotFoundError as error:
             got = "none: copy or download it, or leave its episodes out (--episodes)"
-            raise DatasetError.at(self.file, f"a file with {self._num_records} episodes", got) from error
+            raise DatasetError.at(self.file, f"a file with {self.num_records} episodes", got) from error
         except OSError as error:
             raise DatasetError.at(self.file, "a readable file", error.strerror) from error
 
@@ -81,9 +80,9 @@ class RecordFile:
         require(where, len(crc) == _CRC.size, f"{length} bytes and a CRC", f"the end of the file: {_AGAIN}")
         is_whole = _CRC.unpack(crc)[0] == _masked_crc(content)
         require(where, is_whole, "content of the stored CRC", f"another: the file is damaged; {_AGAIN}")
-        has_more = number == self._num_records - 1 and bool(opened.read(1))
+        has_more = number == self.num_records - 1 and bool(opened.read(1))
         got = "more: the file is not the one of dataset_info.json; copy or download both again"
-        require(self.file, not has_more, f"{self._num_records} records, as dataset_info.json says", got)
+        require(self.file, not has_more, f"{self.num_records} records, as dataset_info.json says", got)
         return content
 
     def _length(self, opened: BinaryIO, number: int, start: int) -> int:
@@ -146,20 +145,11 @@ def _example_type() -> Any:
 
 
 @dataclass(frozen=True)
-class Shard:
-    """One file in a split, and how many episodes it holds."""
-
-    file: Path
-    split: str
-    num_episodes: int
-
-
-@dataclass(frozen=True)
 class RldsInfo:
     """What the metadata say.
 
     source: name and version
-    shards: in split order
+    files: files with their splits, in split order
     cameras: 8-bit colour picture features, by name below ``steps/observation``
     left_out: other pictures there, with the reason
     instructions: features that hold the task, per step or per episode, best first
@@ -167,7 +157,7 @@ class RldsInfo:
     """
 
     source: str
-    shards: Sequence[Shard]
+    files: Sequence[tuple[str, RecordFile]]
     cameras: Mapping[str, str]
     left_out: Mapping[str, str]
     instructions: Sequence[str]
@@ -179,7 +169,7 @@ class RldsInfo:
 
         task_column: feature with the task, or the last part of its path; None: those in ``INSTRUCTIONS``
         """
-        info = _document(root / _INFO_FILE)
+        info = json_object(root / _INFO_FILE)
         features = _features(root / FEATURES_FILE)
         shown = {name.removeprefix(_OBSERVATION): each for name, each in features.items() if _shown(name, each)}
         faults = {name: _fault(each) for name, each in shown.items()}
@@ -194,7 +184,7 @@ class RldsInfo:
         first, *others = instructions or [""]
         return cls(
             source=f"{info.get('name')}/{info.get('version')}",
-            shards=_shards(root, info),
+            files=_files(root, info),
             cameras=cameras,
             left_out={name: fault for name, fault in faults.items() if fault},
             instructions=instructions,
@@ -202,25 +192,16 @@ class RldsInfo:
         )
 
 
-def _document(file: Path) -> Mapping[str, Any]:
-    try:
-        found = json.loads(file.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
-        raise DatasetError.at(file, "a readable JSON file of TensorFlow Datasets", error) from error
-    require(file, isinstance(found, dict), "a JSON object", type(found).__name__)
-    return dict(found)
-
-
-def _shards(root: Path, info: Mapping[str, Any]) -> list[Shard]:
+def _files(root: Path, info: Mapping[str, Any]) -> list[tuple[str, RecordFile]]:
     where, kind = root / _INFO_FILE, info.get("fileFormat", "tfrecord")
     remedy = f"{kind}: write it again with file_format='tfrecord' (tfds convert_format)"
     require(f"{where}: fileFormat", kind == "tfrecord", "tfrecord", remedy)
     splits = info.get("splits")
     require(f"{where}: splits", isinstance(splits, list) and bool(splits), "at least one split", splits)
-    return [shard for split in splits or () for shard in _shards_of(root, str(info.get("name")), split)]
+    return [file for split in splits or () for file in _files_of(root, str(info.get("name")), split)]
 
 
-def _shards_of(root: Path, dataset: str, split: Any) -> Iterator[Shard]:
+def _files_of(root: Path, dataset: str, split: Any) -> Iterator[tuple[str, RecordFile]]:
     where = f"{root / _INFO_FILE}: splits"
     is_known = isinstance(split, dict) and isinstance(split.get("shardLengths"), list) and bool(split.get("name"))
     require(where, is_known, "name and shardLengths of each split", split)
@@ -235,14 +216,14 @@ def _shards_of(root: Path, dataset: str, split: Any) -> Iterator[Shard]:
         require(f"{where}: {split['name']}", Path(name).name == name, "files in the folder of the version", name)
         is_count = str(length).isdecimal()
         require(f"{where}: {split['name']}: shardLengths", is_count, "a number of episodes", repr(length))
-        yield Shard(root / name, split["name"], int(length))
+        yield split["name"], RecordFile(root / name, int(length))
 
 
 def _features(file: Path) -> Mapping[str, Mapping[str, Any]]:
     """The features with values, by path. Raises DatasetError."""
     expected = "features as TensorFlow Datasets 4.6 or later writes them"
     try:
-        features = dict(_leaves(_document(file)))
+        features = dict(_leaves(json_object(file)))
         for feature in features.values():
             _shape(feature.get("image", feature.get("tensor", {})))
     except (AttributeError, TypeError, ValueError) as error:

@@ -7,7 +7,6 @@ import hashlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +18,6 @@ from rfm_labels.datasets.faults import DatasetError
 
 Times = npt.NDArray[np.float64]
 
-_READ_BYTES = 2**20
-_DIGESTS_AT_A_TIME = 2**16
-
 
 def digest_of(parts: Iterable[bytes]) -> str:
     """Hash the parts, including where one ends and the next begins."""
@@ -32,8 +28,8 @@ def digest_of(parts: Iterable[bytes]) -> str:
     return digest.hexdigest()
 
 
-def file_identity(file: Path, *, verify: bool, revision: str | None = None) -> str:
-    """Return a text that identifies a file: size and modification time, or SHA-256 with ``verify``.
+def file_identity(file: Path, revision: str | None = None) -> str:
+    """Return a text that identifies a file: size and modification time.
 
     revision: commit on the Hub; replaces the time, which differs between machines
 
@@ -41,22 +37,11 @@ def file_identity(file: Path, *, verify: bool, revision: str | None = None) -> s
     """
     try:
         status = file.stat()
-        if verify:
-            return _sha256(file, status.st_size, status.st_ctime_ns)
     except FileNotFoundError as error:
         raise DatasetError.at(file, "a video file", "none") from error
     except OSError as error:
         raise DatasetError.at(file, "a readable video file", error.strerror) from error
     return f"{status.st_size} {revision or status.st_mtime_ns}"
-
-
-@lru_cache(_DIGESTS_AT_A_TIME)
-def _sha256(file: Path, _size: int, _changed_ns: int) -> str:
-    digest = hashlib.sha256()
-    with file.open("rb") as opened:
-        while content := opened.read(_READ_BYTES):
-            digest.update(content)
-    return digest.hexdigest()
 
 
 def turn_mark(picture: bytes | Path) -> str:
@@ -73,6 +58,25 @@ def faults_at(where: object) -> Iterator[None]:
     except FrameFileError as error:
         place = f"{where}: {error.where}" if error.where else str(where)
         raise DatasetError.like(error, where=place) from error
+
+
+def check_pictures(pictures: Iterable[bytes | Path], where: str = "") -> None:
+    """Raise DatasetError unless the headers of these files are those of pictures. where: of contents, for messages"""
+    for place, picture in _placed(pictures, where):
+        with faults_at(place):
+            picture.check()
+
+
+def picture_frames(pictures: Iterable[bytes | Path], where: str = "") -> Iterator[UInt8Array]:
+    """Yield the pixels of these files, uint8 [H, W, 3] each. Raises DatasetError. where: as in ``check_pictures``"""
+    for place, picture in _placed(pictures, where):
+        with faults_at(place):
+            yield picture.pixels()
+
+
+def _placed(pictures: Iterable[bytes | Path], where: str) -> Iterator[tuple[object, Picture]]:
+    for t, picture in enumerate(pictures):
+        yield picture if isinstance(picture, Path) else f"{where}: frame {t}", Picture(picture)
 
 
 @dataclass(frozen=True, eq=False)

@@ -192,10 +192,8 @@ def _decode_sample(row: Row, known: Known) -> Sample:
         if views or GOAL in row:
             trajectory = replace(trajectory, views=views, goal=row.get(GOAL))
         return ProgressSample(trajectory, frame_steps)
-    if given := [name for name in (*VIEWS, GOAL) if name in row]:
+    if given := [name for name in (*VIEWS, GOAL, FRAME_DIGESTS) if name in row]:
         raise InvalidSampleError.at(SAMPLE_TYPE, f"progress with {given[0]}", SampleType(sample_type).name.lower())
-    if FRAME_DIGESTS in row:
-        raise InvalidSampleError.at(SAMPLE_TYPE, f"progress with {FRAME_DIGESTS}", SampleType(sample_type).name.lower())
     if min(lengths) < 1:
         raise InvalidSampleError.at(NUM_FRAMES, "at least one frame of each of the two trajectories", str(lengths))
     if frame_steps != 0:
