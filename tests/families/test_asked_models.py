@@ -18,6 +18,7 @@ import rfm_export
 from reward_models import BASE, ROOT, as_before_marks
 from rfm import published
 from rfm.config import ExportConfig
+from rfm.files import CheckpointError
 
 CHECKPOINT = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied"
 OF_LEROBOT = ROOT / "topreward" / "lerobot_plain" / "lerobot"
@@ -107,6 +108,8 @@ def test_the_options_or_the_name_decide_how_roboreward_is_asked(
     assert config.strict_answers is options.get("strict_answers", False)
     checkpoint.save(tmp_path / "saved")
     assert published.load(tmp_path / "saved").config == config
+    with pytest.raises(CheckpointError, match="--as: expected the reward model of this export"):
+        published.load(tmp_path / "saved", reward_model="roboreward" if is_expected else "roboreward-expected")
 
 
 def test_a_file_without_a_dtype_gets_a_line(tmp_path: Path) -> None:

@@ -241,6 +241,10 @@ WRONG = {
     ),
     "bins": (lambda c: c["value_tokenizer_config"].update(support_transform="log"), "support_transform: expected one"),
     "edges": (lambda c: c["value_tokenizer_config"].update(support_transform="quantile"), "33 ascending numbers"),
+    "edges that fall": (
+        lambda c: c["value_tokenizer_config"].update(support_transform="quantile", bin_edges=[*range(33, 0, -1)]),
+        "33 ascending numbers",
+    ),
     "heads": (lambda c: c.update(num_value_heads=3), "value_heads.2.proj"),
 }
 
