@@ -80,7 +80,7 @@ def test_three_broken_episodes_are_named_at_once_and_left_out_by_the_list_that_i
         (
             "episode_000001.parquet: expected a Parquet file, got none",
             "episode_000003.mp4: expected a video file, got none",
-            "episode_000005.mp4: expected a whole video file, got ",
+            "episode_000005.mp4: expected a file with a video stream, got ",
         ),
         strict=False,
     ):

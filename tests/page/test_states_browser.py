@@ -79,7 +79,7 @@ def test_a_page_goes_on_without_a_reload_when_triton_a_key_and_a_broken_dataset_
         browser.until("!document.querySelector('#away .state, #served-state .state')")
         assert browser.run("return window.isFirst")
         broken = "document.querySelector('#episodes tr[data-episode=\"2\"]')"
-        message = "episode_000002.mp4: expected a whole video file, got "
+        message = "episode_000002.mp4: expected a file with a video stream, got "
         assert message in browser.until(f"{broken}.querySelector('.failed')?.textContent")
         assert len(browser.all("#episodes .failed")) == 1
         browser.run(f"{broken}.querySelector('button').click()")
