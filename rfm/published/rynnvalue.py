@@ -19,7 +19,7 @@ from rfm.published.language import dtype_of, reopened
 from rfm.published.provenance import Assumption, source_name
 from rfm.published.qwen import QWEN_NAMES, UNUSED, backbone_config, renamed
 from rfm.published.reader import Loaded, Reader
-from rfm.published.rounding import read_published, read_unrounded_config
+from rfm.published.rounding import kind_of, read_published, read_unrounded_config
 from rfm.qwen.language import EMBEDDING
 from rfm.qwen.network import QWEN3
 from rfm.qwen.processor import PROCESSOR_CONFIG, pixel_limits, read_processor
@@ -236,6 +236,7 @@ def _published(folder: Path, content: dict[str, Any], options: CheckpointConfig)
     config = RynnConfig(
         backbone=backbone,
         base_model_id=source_name(processor),
+        weights=kind_of(weights),
         **{**fields, **limits, **(meta if fields["use_meta"] else {})},
     )
     notes = [f"{name}: not expected, and not used: scores may differ from the original's" for name in read.unexpected]

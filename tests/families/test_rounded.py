@@ -44,6 +44,7 @@ SAMPLES = [
     ProgressSample(video(1, 4, 84, 60)),
     ProgressSample(video(2, 2, 64, 64)),
 ]
+RYNNVALUE = ROOT / "rynnvalue" / "linear_2heads_nometa_fp32" / "checkpoint"
 ROBOREWARD = ROOT / "roboreward" / "rr_tied_bf16" / "checkpoint"
 TOPREWARD = ROOT / "topreward" / "checkpoints" / "vlm_fp32_untied"
 
@@ -228,23 +229,32 @@ def _is_of(key: str, path: str) -> bool:
     )
 
 
-def test_an_ordinary_qwen_in_nf4_is_read(tmp_path: Path) -> None:
-    folder = tmp_path / "Qwen3-VL-bnb-4bit"
-    folder.mkdir()
-    for file in ROBOREWARD.iterdir():
-        (folder / file.name).write_bytes(file.read_bytes())
+def with_layers_in_nf4(source: Path, folder: Path) -> Path:
+    """A copy of the checkpoint with its layers in NF4, as bitsandbytes saves them."""
+    shutil.copytree(source, folder, copy_function=shutil.copyfile)
     few_bits = {}
     for key, tensor in load_file(folder / "model.safetensors").items():
         is_linear = key.endswith(".weight") and (".layers." in key or ".blocks." in key) and tensor.ndim == 2
         few_bits |= in_nf4(key, tensor)[0] if is_linear else {key: tensor}
     save_file(few_bits, folder / "model.safetensors", {"format": "pt"})
     change_config(folder, "nf4")
-    as_published = published.load(folder, reward_model="roboreward-expected")
+    return folder
+
+
+def test_an_ordinary_qwen_in_nf4_is_read(tmp_path: Path) -> None:
+    as_published = published.load(with_layers_in_nf4(ROBOREWARD, tmp_path / "4bit"), reward_model="roboreward-expected")
     rounded_here = published.load(ROBOREWARD, reward_model="roboreward-expected", weights="nf4")
     assert as_published.config.weights == "nf4"
     scores = [Engine.of(each).evaluate(SAMPLES) for each in (as_published, rounded_here)]
     for result, expected in zip(*scores, strict=True):
         assert_close(result, expected, 1e-6)
+
+
+def test_a_rynnvalue_in_nf4_is_not_rounded_again(tmp_path: Path) -> None:
+    folder = with_layers_in_nf4(RYNNVALUE, tmp_path / "4bit")
+    assert published.load(folder).config.weights == "nf4"
+    with pytest.raises(CheckpointError, match=r"^--weights: expected .* whose weights are not rounded"):
+        published.load(folder, weights="int8")
 
 
 def test_weights_that_are_rounded_are_not_rounded_in_another_way(tmp_path: Path) -> None:
