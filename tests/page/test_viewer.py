@@ -134,4 +134,4 @@ def test_a_video_that_needs_too_much_memory_is_refused(triton: Triton, videos: P
         video = {"video": videos / "clip.mp4"}
         curve_of(events(post(gateway.url, SCORE, video, fps="1", sampling="all", **QUESTION)))
         assert gateway.metric("samples_total", sample_type="progress") == 3
-        assert gateway.metric("requests_total", endpoint=SCORE, code="413") == 1
+        assert gateway.metric("requests_total", endpoint=f"/{SCORE}", code="413") == 1

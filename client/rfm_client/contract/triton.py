@@ -178,7 +178,7 @@ def unreachable(url: str, reason: str) -> errors.ServerUnavailableError:
     """Return the error for a failed connection to the server or its proxy."""
     found = _REASON.search(reason)
     reason, remedy = (found[1] if found else reason), _START
-    if url.startswith("grpc") and _NO_GRPC.search(reason):
+    if url.startswith("grpc://") and _NO_GRPC.search(reason):
         reason, remedy = "no answer of Triton's gRPC port (by default 8001)", _GRPC_PORT
     if grpc_proxy(url):
         remedy += "; or add the host to no_proxy, unless this proxy leads to it"
