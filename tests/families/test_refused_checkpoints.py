@@ -358,6 +358,8 @@ IN_WORDS: dict[str, tuple[str, Spoil, str]] = {
     "no language head": (TOP, weights(lambda w: w.pop(HEAD)), r"expected lm_head.weight, since tie_word_embeddings is false, got none"),
     "a template without the video": (TOP, template_of_text, r"chat template: expected one video in a prompt, got 0"),
     "an unknown key of LeRobot": (TOP_LEROBOT, settings(CONFIG, frame_stride=2), r"expected the keys of LeRobot's topreward, got 'frame_stride'"),
+    "a suffix without the task": (TOP_LEROBOT, settings(CONFIG, prompt_suffix_template="Done?"), r"prompt_suffix: expected text with \{instruction\}, got 'Done\?'"),
+    "a suffix with another name": (TOP_LEROBOT, settings(CONFIG, prompt_suffix_template="{task}: Yes"), r"prompt_suffix: expected text with \{instruction\}, got '\{task\}: Yes'"),
     "a penalty": (ROBO, settings("generation_config.json", repetition_penalty=1.1), r"repetition_penalty: expected 1.0, got 1.1; remove it"),
     "an unknown key of generation": (ROBO, settings("generation_config.json", suppress_tokens=[1]), r"suppress_tokens: expected no such key, got \[1\]"),
     "no end of an answer": (ROBO, settings("generation_config.json", eos_token_id=None), r"eos_token_id: expected ids of tokens, got None"),
