@@ -122,8 +122,7 @@ export class Videos {
 
   /** Removes a video. */
   remove(entry) {
-    entry.player.pause();
-    URL.revokeObjectURL(entry.player.src);
+    release(entry.player);
     entry.figure.remove();
     this.#entries = this.#entries.filter((each) => each !== entry);
     this.#fit();
@@ -131,8 +130,7 @@ export class Videos {
 
   /** Removes all videos. */
   clear() {
-    this.pause();
-    for (const { player } of this.#entries) URL.revokeObjectURL(player.src);
+    for (const { player } of this.#entries) release(player);
     this.#entries = [];
     this.#host.replaceChildren();
     this.#fit();
@@ -196,4 +194,13 @@ export class Videos {
 function show(entry, { orient, channels }) {
   Object.assign(entry, { orient, channels });
   entry.player.className = `${orient} ${channels}`;
+}
+
+/** Ends a player's load, then gives its file back: a load that finds it gone would be an error. */
+function release(player) {
+  const url = player.src;
+  player.pause();
+  player.removeAttribute("src");
+  player.load();
+  URL.revokeObjectURL(url);
 }
