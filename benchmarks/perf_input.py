@@ -42,10 +42,20 @@ def main() -> None:
         for length in given.num_frames:
             samples += SyntheticSamples(given.sample_type, given.num_samples, length, given.use_frames).samples(client)
     write(given.output, samples)
-    protocol, _, address = given.url.partition("://")
+    scheme, _, address = given.url.partition("://")
     are_frames = samples[0].trajectories[0].frames is not None
     name = frames_name(given.model) if are_frames else given.model
-    words = ["perf_analyzer", "-m", name, "-i", protocol, "-u", address, "--input-data", str(given.output)]
+    words = [
+        "perf_analyzer",
+        "-m",
+        name,
+        "-i",
+        scheme.removesuffix("s"),
+        "-u",
+        address,
+        "--input-data",
+        str(given.output),
+    ]
     print(shlex.join([*words, "--async", "--concurrency-range", "1:16:5"]))
 
 

@@ -192,10 +192,10 @@ def _check_header(file: Path) -> None:
         if start and not any(start):
             raise ValueError(f"zeros, as after an unfinished download; {_AGAIN}")
         length = int.from_bytes(start[:_LENGTH_BYTES], "little")
-        if size < _LENGTH_BYTES + length or size < _LENGTH_BYTES:
-            raise ValueError(f"only {size} bytes; {_AGAIN}")
         if length > MAX_HEADER_BYTES:
             raise ValueError(f"a header of {length} bytes, more than {MAX_HEADER_BYTES}")
+        if size < _LENGTH_BYTES + length:
+            raise ValueError(f"only {size} bytes; {_AGAIN}")
         content.seek(_LENGTH_BYTES)
         header = json.loads(content.read(length), object_pairs_hook=_once)
     for name, tensor in header.items() if isinstance(header, dict) else ():

@@ -40,7 +40,7 @@ class EngineScorer:
 
         dtype: the network's type; None: float32 on the CPU, else the checkpoint's own
         options: as in ``rfm.published.read``
-        Raises ExportError for a missing device, and errors as ``read``.
+        Raises ExportError for a missing device, and what ``rfm.published.read`` raises.
         """
         on = device_named(device)
         loaded = published.read(source, **options)

@@ -79,9 +79,9 @@ def read_for_export(
     *,
     other_machine: bool,
 ) -> Source:
-    """Read and check all that an export needs, before it writes. Parameters and errors: see ``export``.
+    """Read and check all that an export needs, before it writes; report doubts to ``say``.
 
-    Tell the user which file has the training run's settings, and about possible faults.
+    Parameters and errors: see ``export``.
     """
     if not other_machine:
         _check_gpus(settings.num_gpus)

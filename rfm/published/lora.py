@@ -112,9 +112,9 @@ def _layers(file: Path, config: Mapping[str, Any], backbone: dict[str, Any], roo
 
 
 def _without_patterns(file: Path, config: Mapping[str, Any], modules: Sequence[str]) -> dict[str, Any]:
-    """Return the fields that PEFT applies, with the names of modules in place of patterns, in bounded time.
+    """Return the fields that PEFT applies, with module names instead of patterns, in bounded time.
 
-    Raises CheckpointError for a pattern that is none, takes too long, or should change the scaling of no module.
+    Raises CheckpointError for a pattern that is invalid, takes too long, or matches no module.
     """
     import regex  # a dependency of transformers; Python's own has no time limit
 
@@ -141,9 +141,7 @@ def _without_patterns(file: Path, config: Mapping[str, Any], modules: Sequence[s
         for pattern, value in fields.get(field, {}).items():
             if not (found := matches(field, pattern, r"(.*\.)?({})$")):
                 remedy = "remove it if it changed none in training, or merge the adapter there"
-                raise CheckpointError.at(
-                    f"{file}: {field}", "patterns of modules", f"{shown(pattern)}, of none", remedy
-                )
+                raise CheckpointError.at(f"{file}: {field}", "a pattern that matches a module", shown(pattern), remedy)
             require(f"{file}: {field}", _is_number(value), "finite numbers", shown(value), CheckpointError)
             if names := left.intersection(found):  # the first pattern counts
                 of_module[f"^(?:{'|'.join(map(re.escape, sorted(names)))})"] = value

@@ -132,7 +132,7 @@ def _encoders(checkpoint: RewindCheckpoint, sources: tuple[str, str]) -> Encoder
 def _having_encoders(sources: tuple[str, str]) -> Iterator[None]:
     try:
         yield
-    except misfits(ImportError, OSError) as error:
+    except misfits(ImportError, OSError, CheckpointError) as error:
         absent = [source for source in sources if not Path(source).is_dir()]
         here = f"; there is no folder {' nor '.join(absent)} either" if absent else ""
         hint = f"name local folders with --image-encoder and --text-encoder{here}"

@@ -258,7 +258,7 @@ def is_lerobot(content: Mapping[str, Any]) -> bool:
 def lerobot_run(content: Mapping[str, Any], file: Path) -> RunConfig:
     """Return the settings in LeRobot's config.json. Raises CheckpointError for a missing, null or unknown key."""
     needed = (LEROBOT_BACKBONE, *_DECIDING["model"])
-    check_lerobot(content, file, needed, {_BINS, _LOSS, "max_frames", "reward_output"})
+    check_lerobot(content, file, needed, {_BINS, _LOSS, *_DECIDING["data"], "reward_output"})
     sections = {name: {key: content.get(key) for key in keys} for name, keys in _DECIDING.items()}
     sections["data"] |= {"resized_height": None, "resized_width": None}  # LeRobot has no common frame size
     return RunConfig(file, NETWORK_CONFIG, {"training": {}, "peft": {}, **sections}, has_sections=False)

@@ -181,5 +181,6 @@ def rounded_as_asked(checkpoint: Checkpoint, kind: Weights | None) -> Checkpoint
     left: dict[str, Any] = {"factors": factors} if LORA in checkpoint.parts else {}
     changed = replace(checkpoint, config=replace(checkpoint.config, weights=kind), weights=whole, **left)
     changed.check()
-    vars(changed).update({name: each for name, each in vars(checkpoint).items() if name == "collator"})  # read once
+    if "collator" in vars(checkpoint):  # cached: the processor is read once
+        vars(changed)["collator"] = checkpoint.collator
     return changed

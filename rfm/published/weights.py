@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from rfm.files import (
     NETWORK_CONFIG,
+    SHARDS,
     WEIGHTS,
     WEIGHTS_INDEX,
     CheckpointError,
@@ -82,7 +83,7 @@ def _check_network(folder: Path, names: Iterable[str], model_type: str | None) -
 
 
 def _read_shards(index: Path) -> dict[str, Tensor]:
-    """Return each tensor from the shard that the index names for it."""
+    """Return each tensor from the shard that the index names for it. Raises CheckpointError."""
     weight_map = read_json(index).get("weight_map")
     if not isinstance(weight_map, dict):
         raise CheckpointError.at(index, "a weight_map", "none")
@@ -99,6 +100,10 @@ def _read_shards(index: Path) -> dict[str, Tensor]:
             )
         weights |= tensors
     check_names(weight_map.keys(), weights.keys())
+    for file in sorted(index.parent.glob(SHARDS)):
+        if file.name not in weight_map.values() and (unknown := sorted(read_tensors(file).keys() - weights.keys())):
+            got = f"{file.name}, which it does not name, with {listed(unknown)}"
+            raise CheckpointError.at(index, "the names of all shards", got, "name a copy of the folder without it")
     return weights
 
 

@@ -226,7 +226,7 @@ class VlmBatch:
         return sum(ids.numel() for ids in (self.inputs["input_ids"], *(packs.input_ids for packs in self.packs)))
 
     def pinned(self) -> VlmBatch:
-        """Return the batch with all tensors except the frames in pinned memory, from which a GPU copies meanwhile."""
+        """Return the batch with all tensors except the frames in pinned memory, which a GPU copies asynchronously."""
         return self._changed(Tensor.pin_memory)
 
     def to(self, device: torch.device, dtype: torch.dtype) -> VlmBatch:

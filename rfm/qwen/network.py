@@ -40,7 +40,7 @@ QWEN3 = "qwen3_vl"
 BARE: Final = "bare"
 WRAPPED: Final = "wrapped"
 FULL_ATTENTION = "full_attention"
-MAX_LAYERS = 1024  # more would be made for hours, and no model has them
+MAX_LAYERS = 1024  # building more would take hours, and no model has more
 Dtype: TypeAlias = Literal["float32", "bfloat16", "float16"]
 
 
@@ -102,7 +102,7 @@ def qwen_states(
 def build_backbone(config: BackboneConfig, dtype: torch.dtype) -> nn.Module:
     """Return the backbone with uninitialised weights in ``dtype``; buffers keep their own dtype.
 
-    Raises CheckpointError for a language model with other layers than full attention, and for thousands of layers.
+    Raises CheckpointError for more than MAX_LAYERS layers, and for a language model with any layer but full attention.
     """
     try:
         import transformers

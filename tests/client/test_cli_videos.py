@@ -26,6 +26,7 @@ from rfm_client import (
     Trajectory,
     load_trajectory,
 )
+from rfm_client.cli import pictures
 from rfm_client.cli.comparing import LEGEND, Comparison, compare
 from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.pictures import Panel, plot
@@ -201,22 +202,32 @@ def test_a_plot_has_a_strip_for_each_video_and_is_drawn_without_scores_too(tmp_p
     assert (np.diff(middles) >= float(corners[0][1])).all()
 
 
-@pytest.mark.parametrize("positions", [[0, 4.9, 5.1, 10], [0, 0.01, 0.02, 0.03, 9], [*range(10), 9.01, 40], [3]])
-def test_frames_of_a_strip_are_even_in_time_so_that_none_is_tiny(positions: list[float]) -> None:
+@pytest.mark.parametrize(
+    "positions", [[0, 4.9, 5.1, 10], [0, 0.01, 0.02, 0.03, 9], [*range(10), 9.01, 40], [0, 0.0557, 0.2395], [3]]
+)
+def test_frames_of_a_strip_are_even_in_time_so_that_none_is_tiny(
+    positions: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     times_s = np.array(positions, np.float64)
-    told = FrameScores(progress=np.zeros(len(times_s), np.float32), success=np.zeros(len(times_s), np.float32))
-    shown = Panel.of("", told, np.zeros((len(times_s), 8, 8, 3), np.uint8), times_s).strip_positions
-    assert shown[-1] == times_s[-1]
-    assert (np.diff(shown) >= np.ptp(times_s) / 15).all()
+    scores = FrameScores(progress=np.zeros(len(times_s), np.float32), success=np.zeros(len(times_s), np.float32))
+    panel = Panel.of("", scores, np.zeros((len(times_s), 16, 9, 3), np.uint8), times_s)
+    assert panel.strip_positions[-1] == times_s[-1]
+    assert (np.diff(panel.strip_positions) >= np.ptp(times_s) / 15).all()
+    figures: list[Any] = []
+    monkeypatch.setattr(pictures, "save", lambda figure, _file: figures.append(figure))
+    plot(tmp_path / "strip.png", [panel])
+    first, last = figures[0].axes[0].get_xlim()
+    assert first <= times_s[0]  # the whole curve is shown
+    assert times_s[-1] <= last
 
 
 def test_without_matplotlib_a_plot_fails_with_the_command_that_installs_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.style", None)
-    told = FrameScores(progress=np.zeros(1, np.float32), success=np.zeros(1, np.float32))
+    scores = FrameScores(progress=np.zeros(1, np.float32), success=np.zeros(1, np.float32))
     with pytest.raises(ImportError, match=r'plots need matplotlib: pip install "\./client\[cli\]"'):
-        plot(tmp_path / "plot.svg", [Panel.of("", told)])
+        plot(tmp_path / "plot.svg", [Panel.of("", scores)])
 
 
 ORDERS: dict[str, tuple[dict[tuple[int, int], float], list[int | None], list[int] | None, list[str]]] = {

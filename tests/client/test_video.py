@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Trajectories from video files and URLs: frames, parts, and colours, which equal those of ``ffmpeg -pix_fmt rgb24``."""
+"""Trajectories from video files: frames, parts, and colours, which equal those of ``ffmpeg -pix_fmt rgb24``."""
 
 from __future__ import annotations
 

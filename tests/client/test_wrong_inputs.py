@@ -19,7 +19,7 @@ from paths import ROOT
 from servers import Endpoints
 
 NOBODY = "grpc://localhost:1"  # where no server listens
-STARTED = "start the server there (rfm serve), or give the URL of one that runs (with TLS: grpcs:// or https://)"
+STARTED = "start the server there (rfm serve), or give the URL of one that runs (with TLS: grpcs:// or https://; without: grpc:// or http://)"
 URL = "expected grpc://host:port or http://host:port, or grpcs:// or https:// (brackets around an IPv6 address), got"
 DATASET = (
     "expected a LeRobot dataset (meta/info.json), an RLDS dataset (features.json), an HDF5 file (.hdf5, .h5), a folder "

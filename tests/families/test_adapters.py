@@ -177,7 +177,7 @@ def test_factors_in_bfloat16_are_scaled_in_float32(tmp_path: Path) -> None:
     (name,) = [
         name
         for name in load_file(folder / FACTORS)
-        if re.search(r"text|language_model.layers.1.self_attn.q_proj.lora_B", name)
+        if re.search(r"language_model\.layers\.1\.self_attn\.q_proj\.lora_B", name)
     ]
     written = load_file(folder / FACTORS)[name]
     read = load(ADAPTER, folder, options["base_model"]).factors[
@@ -314,7 +314,7 @@ REFUSED: dict[str, tuple[str, Spoil, str]] = {
     "a run of another rank": (LORA_INSIDE, run_settings("peft", r=32), r"config\.yaml: r: expected 4, the rows of .*lora_A, got 32; put in r"),
     "a module of another rank": (LORA_INSIDE, weights(of_another_rank), r"r: expected 8, the rows of model\.language_model\.layers\.1\.mlp\.up_proj\.lora_A, got 4"),
     "a run and an adapter that disagree": (LORA_INSIDE, both(beside_its_adapter, settings(CONFIG, lora_alpha=16)), r"adapter_config\.json: expected r 4 and lora_alpha 8, as .*config\.yaml has it, got r 4 and lora_alpha 16; mend the wrong one"),
-    "a pattern of no module": (ADAPTER, settings(CONFIG, alpha_pattern={"^layers.0": 16}), r"adapter_config\.json: alpha_pattern: expected patterns of modules, got '\^layers\.0', of none; remove it"),
+    "a pattern of no module": (ADAPTER, settings(CONFIG, alpha_pattern={"^layers.0": 16}), r"adapter_config\.json: alpha_pattern: expected a pattern that matches a module, got '\^layers\.0'; remove it"),
     **{
         f"no pattern: {field}": (ADAPTER, settings(CONFIG, **{field: value}), rf"adapter_config\.json: {field}: expected a pattern of names, got '\(q_proj': .*; write the names")
         for field, value in {"target_modules": "(q_proj", "exclude_modules": "(q_proj", "rank_pattern": {"(q_proj": 4}, "alpha_pattern": {"(q_proj": 4}}.items()
@@ -371,7 +371,7 @@ def test_patterns_among_whole_weights_begin_where_peft_s_do(tmp_path: Path, patt
         torch.testing.assert_close(changed[name], factor * times, rtol=1e-6, atol=0)
 
 
-def test_a_missing_package_of_peft_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_peft_is_named_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "peft", None)
     with pytest.raises(ImportError, match=r'LoRA needs PEFT: pip install "\.\[vlm\]" \(.*peft'):
         load(ADAPTER)

@@ -198,6 +198,7 @@ WEIGHT_FILES: dict[str, tuple[str, Spoil, str]] = {
     "whole and in shards without an index": (REWIND, lambda f: shutil.copy(f / WEIGHTS, f / "model-00001-of-00002.safetensors"), r"got model\.safetensors and \['model-00001-of-00002\.safetensors'\]"),
     "an encoder whole and in shards": (ENCODED, without_encoders(beside("image_encoder", text("model.safetensors.index.json", '{"weight_map": {}}'))), r"image_encoder: expected model\.safetensors or shards, got"),
     "a tensor in two shards": (REWIND, both(in_two_shards, shard_twice), r"expected the tensors in b\.safetensors, got no \['first_embedding_A', .*; save the weights again"),
+    "a shard that the index does not name": (REWIND, extra_shard("model-00003-of-00003.safetensors", {"more": torch.ones(1)}), r"expected the names of all shards, got model-00003-of-00003\.safetensors, which it does not name, with \['more'\]; name a copy of the folder without it"),
     "a lost shard": (REWIND, both(in_two_shards, gone("b.safetensors")), r"names the shard b.safetensors, which is not there"),
     "a shard elsewhere": (REWIND, instead(WEIGHTS, lambda f: Path(f"{f}.index.json").write_text('{"weight_map": {"a": "../secret.safetensors"}}')), r"expected names of files beside it, got '\.\./secret"),
     "a shard with a NUL": (REWIND, instead(WEIGHTS, lambda f: Path(f"{f}.index.json").write_text('{"weight_map": {"a": "a\\u0000.safetensors"}}')), r"expected a file|not there"),
@@ -212,7 +213,7 @@ WEIGHT_FILES: dict[str, tuple[str, Spoil, str]] = {
     "an empty file": (REWIND, lambda f: (f / WEIGHTS).write_bytes(b""), SAFETENSORS + "only 0 bytes; fetch or copy it again"),
     "a file cut in its header": (REWIND, cut_to(100), SAFETENSORS + "only 100 bytes; fetch or copy it again"),
     "a file cut in its tensors": (REWIND, cut_to(-100), SAFETENSORS + ".*; fetch or copy it again"),
-    "a header of 2^63 bytes": (REWIND, lambda f: (f / WEIGHTS).write_bytes(struct.pack("<Q", 2**63) + b"{}"), SAFETENSORS + "only 10 bytes"),
+    "a header of 2^63 bytes": (REWIND, lambda f: (f / WEIGHTS).write_bytes(struct.pack("<Q", 2**63) + b"{}"), SAFETENSORS + f"a header of {2**63} bytes, more than"),
     "a header that fits but is huge": (REWIND, raw_header(lambda _: b"{" + b" " * MAX_HEADER_BYTES + b"}"), SAFETENSORS + f"a header of {MAX_HEADER_BYTES + 2} bytes, more than"),
     "a deep header": (REWIND, raw_header(lambda _: b"[" * 2**20), SAFETENSORS),
     "a tensor twice": (REWIND, raw_header(twice), SAFETENSORS + f"the key '{FIRST}' twice"),
@@ -279,8 +280,8 @@ SETTINGS: dict[str, tuple[str, Spoil, str]] = {
     "two words on one setting": (Q3, run_settings("data", use_multi_image=False), r"expected model\.use_multi_image and data\.use_multi_image to agree, got model\.use_multi_image true and data\.use_multi_image false"),
     "answers in generated text": (Q3, run_settings("model", model_type="vqa"), r"model\.model_type: expected default, got 'vqa'; models that answer in generated text are not served"),
     "no reward heads": (Q3, weights(lambda w: w.pop("progress_head.4.weight")), r"expected reward heads, got no progress_head.4.weight"),
-    "a run of before 2026-01-21": (Q3, weights(lambda w: w.pop("frame_pool_attn.weight")), r"expected frame_pool_attn\.weight, got none; a run of before 2026-01-21 had 8 special tokens"),
-    "eight special tokens": (Q3, eight_special_tokens, r"tokens .*, got 451; .*a run of before 2026-01-21 had 8 special tokens"),
+    "a run of before 2026-01-21": (Q3, weights(lambda w: w.pop("frame_pool_attn.weight")), r"expected frame_pool_attn\.weight, got none; a run from before 2026-01-21 had 8 special tokens"),
+    "eight special tokens": (Q3, eight_special_tokens, r"tokens .*, got 451; .*a run from before 2026-01-21 had 8 special tokens"),
     "the processor of another model": (Q3, lambda f: [shutil.rmtree(f.parent / "base_model"), shutil.copytree(goldens.config(Q25).sources["base_model"], f.parent / "base_model")], r"expected a tokenizer of 451 tokens .*, got 447"),
 }  # fmt: skip
 

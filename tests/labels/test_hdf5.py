@@ -184,6 +184,7 @@ FILTERS: dict[str, tuple[dict[str, Any], str]] = {
 def test_a_filter_key_chooses_demonstrations(three: Path) -> None:
     for key, names in {"train": ["demo_2", "demo_0"], "valid": ["demo_1"], "gone": ["demo_7"]}.items():
         changed(three, put(f"mask/{key}", np.array(names, dtype="S8")))  # as robomimic's split_train_val.py
+    changed(three, put("mask/others", np.array(["demo_0", "demo_00"], dtype="S8")))  # demo_00 is not in the file
     assert open_dataset(three).filter_keys == {"gone": [7], "train": [0, 2], "valid": [1]}
     report = label(open_dataset(three), BrightnessScorer(), LabelOptions(filter_key="train"))
     assert [item.episode.name for item in report.plan.items] == ["demo_0", "demo_2"]

@@ -181,7 +181,7 @@ def test_info_has_the_same_keys_at_a_reset_and_at_a_step(judge: Recorder, kind: 
 
 @at_each_door
 def test_shaping_of_another_reward_pays_the_last_state_after_a_time_limit(judge: Recorder, kind: type[Door]) -> None:
-    """PAID has an end that is no time limit, "shaping of the environment's own", whose last state pays nothing."""
+    """An end without a time limit pays nothing for its state: see "shaping of the environment's own" in PAID."""
     asked = options(mode="shaping", gamma=GAMMA, add_to_env_reward=True, scale=2.0)
     with opened(kind, judge, [CodedEnv(TRUNCATES, (LAST,))], asked) as door:
         ended = played(door, LAST + 1)[0][0]

@@ -102,11 +102,12 @@ def mutual(running: Serving, papers: Papers) -> Endpoints:
 
 
 @pytest.mark.parametrize("scheme", ["grpc", "http"])
-def test_the_error_of_a_client_without_tls_names_the_url_with_tls(secure: Endpoints, scheme: str) -> None:
+def test_a_client_without_tls_gets_a_remedy_that_names_tls(secure: Endpoints, scheme: str) -> None:
     url = secure.grpc_url.replace("grpcs", scheme)
     with RewardClient(url, retry=False) as asked, pytest.raises(ServerUnavailableError) as caught:
         asked.progress(TRAJECTORY)
-    assert f"{scheme}s://" in str(caught.value)
+    assert caught.value.fault.startswith(f"{url}: no connection: ")
+    assert f"{scheme}s://" in caught.value.remedy
 
 
 def test_a_client_without_tls_or_a_certificate_gets_no_connection(

@@ -14,8 +14,9 @@ import numpy as np
 
 from rfm_client import ProgressResult, RewardClient, Trajectory, UInt8Array
 from rfm_client.episodes import Episode, StepScore
+from rfm_client.transport.calls import TritonTransport
 from tolerances import TOLERANCE
-from transports import Answer, Connection, Tensors
+from transports import Answer, Tensors
 
 MODEL = "enc_c1_t1_disc10"
 MAX_FRAMES = 16  # of that checkpoint
@@ -78,7 +79,7 @@ def assert_close(left: Any, right: Any) -> None:
     np.testing.assert_allclose(left, right, rtol=0, atol=TOLERANCE)
 
 
-class SlowConnection(Connection):
+class SlowConnection(TritonTransport):
     """A connection to the real server that holds questions by the length of the longest trajectory."""
 
     def __init__(self, url: str) -> None:

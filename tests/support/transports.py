@@ -8,14 +8,10 @@ from typing import Any
 from rfm_client.contract.wire import Tensors
 from rfm_client.transport.calls import Answer, TritonTransport
 
-__all__ = ["Answer", "Connection", "Recording", "Tensors"]
+__all__ = ["Answer", "Recording", "Tensors"]
 
 
-class Connection(TritonTransport):
-    """A connection to a real server, for tests to extend."""
-
-
-class Recording(Connection):
+class Recording(TritonTransport):
     """Keeps the inputs of each request."""
 
     def __init__(self, url: str) -> None:

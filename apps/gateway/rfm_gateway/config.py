@@ -124,7 +124,8 @@ class GatewayConfig(Settings):
 
     async def status(self, timeout_s: float) -> ServerStatus:
         """Read the state of Triton and the devices. Raises ServerError."""
-        return await ServerStatus.read_async(  # in one event loop, since gRPC keeps each that it has met
+        # not asyncio.run in a thread: gRPC would keep an event loop for each call
+        return await ServerStatus.read_async(
             self.triton_url,
             metrics_url=self.metrics_url,
             timeout_s=timeout_s,

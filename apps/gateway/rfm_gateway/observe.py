@@ -21,8 +21,14 @@ from rfm_gateway.config import GatewayConfig
 Returned = TypeVar("Returned")
 
 ENDPOINTS = (
-    *("/evaluate_batch", "/evaluate_batch_npy", "/viewer/score", "/viewer/compare"),
-    *("/gpu_status", "/health", "/model_info", "/metrics"),
+    "/evaluate_batch",
+    "/evaluate_batch_npy",
+    "/viewer/score",
+    "/viewer/compare",
+    "/gpu_status",
+    "/health",
+    "/model_info",
+    "/metrics",
 )
 CALLER_LEFT = 499  # as nginx logs it
 

@@ -81,7 +81,7 @@ def planned(dataset: Dataset, scorer: Scorer, outputs: Outputs, watch: Watch = Q
                 raise DatasetError(problem, error.where) from error
             labels = f"its labels of {len(file.digests)} episodes are" if file.digests else "it is"
             watch.note(f"--overwrite: {error}; {labels} replaced")
-    checked_episodes(dataset, options, watch)  # last, since it reads most
+    checked_episodes(dataset, options, watch)  # after the cheap refusals
     return plan
 
 

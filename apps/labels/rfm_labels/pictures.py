@@ -32,11 +32,10 @@ def draw_evaluation(file: Path, comparison: LabelComparison, labels: Sequence[Pa
         axes = figure.subplots(count, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
         origins, known = [_origin(each) for each in labels], comparison.is_success
         for ax, each, (_, checkpoint) in zip(axes, comparison.evaluations, origins, strict=True):
-            ends, colours = [each.final_progress], None
+            ends, colours, names = [each.final_progress], None, None
             if known is not None:
                 ends = [each.final_progress[~known], each.final_progress[known]]
-                colours = [FAILURE_COLOUR, SUCCESS_COLOUR]
-            names = ["failures", "successes"][: len(ends)]
+                colours, names = [FAILURE_COLOUR, SUCCESS_COLOUR], ["failures", "successes"]
             ax.hist(ends, bins=BINS, range=(0, 1), color=colours, label=names, stacked=True)
             ax.set(ylabel="episodes", xlim=(0, 1))
             measures = {

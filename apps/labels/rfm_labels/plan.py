@@ -305,8 +305,7 @@ def checked_episodes(
     cameras, views = chosen_cameras(dataset, options, everywhere)
     episodes: list[DatasetEpisode] = []
     faults: dict[int, RewardError] = {}
-    if not tables_only:
-        watch.checking(len(numbers))
+    watch.checking(len(numbers))
     for number in numbers:
         try:
             episode = dataset.episode(number)
@@ -318,8 +317,7 @@ def checked_episodes(
             for camera in () if tables_only else dict.fromkeys((*cameras, *views)):
                 dataset.check(episode, camera)
             episodes.append(episode)
-            if not tables_only:
-                watch.checked(episode)
+            watch.checked(episode)
         except RewardError as fault:
             faults[number] = fault
     if faults and options.shard is not None:
@@ -342,13 +340,13 @@ def all_faults(dataset: Dataset, options: LabelOptions) -> Iterator[None]:
 
 
 def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch = QUIET) -> Plan:
-    """Check everything except the frames, report decisions to ``watch``, and return the plan.
+    """Check tables and options, report decisions to ``watch``, and return the plan. Frames are checked later.
 
     Raises DatasetError, RewardError if the scorer does not answer, ValueError if the sampling rule needs a frame count.
     """
     recipe = Recipe.of(options, dataset, scorer.checkpoint())
     with all_faults(dataset, options):
-        episodes = checked_episodes(dataset, options, tables_only=True)
+        episodes = checked_episodes(dataset, options, watch, tables_only=True)
     recipe.check_lengths(episodes)
     several = sum(bool(episode.tasks) for episode in episodes)
     if several:

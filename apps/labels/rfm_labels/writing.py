@@ -7,8 +7,7 @@ everything that decides the labels, so any run may reuse the part.
 ``<name>_progress.parquet``: the format that LeRobot's reward-aligned behaviour cloning and the Hub's visualizer read.
 Columns: int64 ``index``, ``episode_index``, ``frame_index``, then float32 ``progress_sparse``, ``success``, and one set
 per camera. If an episode has several tasks, ``progress`` restarts with each task, and ``progress_sparse`` adds up the
-gains. If the model skips frames, ``progress`` is NaN there, and
-``progress_sparse`` is interpolated.
+gains. If the model skips frames, ``progress`` is NaN there, and ``progress_sparse`` is interpolated.
 
 ``reward_signals/<name>.parquet``: LeRobot's frame signals (schema version 1), as its open pull requests propose them.
 Columns: the same int64 columns, then float32 ``reward.<name>.progress``, ``reward.<name>.success_probability``, and one

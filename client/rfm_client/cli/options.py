@@ -257,7 +257,7 @@ class JsonOutput(Settings):
         return {name: value for name in _ENDINGS if (value := getattr(self, name, None)) is not None}
 
     def begin(self, num_videos: int = 0) -> None:
-        """Raise ConfigError, before the first request, for a file that cannot be created or show so many videos."""
+        """Raise ConfigError, before the first request, if a file cannot be created, or cannot show that many videos."""
         for name, file in self._files.items():
             if _ENDINGS[name] == _PICTURES and num_videos > MAX_CURVES:
                 raise ConfigError.at(name, f"at most {MAX_CURVES} videos", num_videos)

@@ -129,7 +129,7 @@ def _frame_in(panel: Panel, curves_in: float) -> tuple[float, float]:
     room_in = curves_in
     if len(panel.strip) > 1:
         nearest = np.diff(panel.strip_positions).min()
-        room_in *= nearest / (np.ptp(panel.strip_positions) + nearest)
+        room_in *= nearest / (np.ptp(panel.positions) + nearest)
     width_in = min(_HIGHEST_FRAME * width_px / height_px, room_in)
     return width_in, width_in * height_px / width_px
 
@@ -137,7 +137,7 @@ def _frame_in(panel: Panel, curves_in: float) -> tuple[float, float]:
 def _draw_strip(axes: Axes, panel: Panel, frame_in: tuple[float, float], curves_in: float) -> None:
     """Draw the frames at their times, and widen the time axis so that none is cut off."""
     assert panel.strip is not None
-    (width_in, height_in), (first, last) = frame_in, panel.strip_positions[[0, -1]]
+    (width_in, height_in), (first, last) = frame_in, panel.positions[[0, -1]]
     margin = (last - first) * width_in / (curves_in - width_in) / 2 if last > first else 0.5
     width = width_in / curves_in * (last - first + 2 * margin) * _FRAME_SHARE
     for frame, position in zip(panel.strip, panel.strip_positions, strict=True):

@@ -194,7 +194,7 @@ def exit_code_of_outcomes(outcomes: Sequence[Outcome]) -> ExitCode:
 
 def unique_stems(names: Sequence[str]) -> list[str]:
     """Return a short name for each source: the file's without suffix, all numbered if one repeats."""
-    stems = [PurePath(name.partition("?")[0]).stem or "video" for name in names]
+    stems = [PurePath(name).stem for name in names]
     is_unique = len(set(stems)) == len(stems)
     return stems if is_unique else [f"{number}_{stem}" for number, stem in enumerate(stems, 1)]
 

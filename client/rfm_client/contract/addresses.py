@@ -136,7 +136,7 @@ _CREDENTIALS = re.compile(r"[^/@]*@")
 
 def grpc_proxy(url: str) -> str | None:
     """Return ``VARIABLE=VALUE`` for the proxy that gRPC uses for the server, without a password; None: no proxy."""
-    scheme, address = split_url(url)
+    scheme, _, address = url.rstrip("/").partition("://")
     name, value = next(((name, os.environ[name]) for name in _PROXY_VARIABLES if name in os.environ), ("", ""))
     if not value or not scheme.startswith("grpc") or is_loopback(host_of(address)):
         return None

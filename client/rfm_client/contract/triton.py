@@ -72,7 +72,10 @@ _FIELDS = re.compile(r"(\S+): expected (.*?), got (.*)", re.DOTALL)  # as writte
 _PREFIX = re.compile(r"^(\[request id: [^\]]*\] )?(in ensemble '[^']*', )?")  # the caller knows both
 
 FEWER_FRAMES = "score some of them (subsample=True), each on few before it (frame_steps), or by a sampling rule"
-_START = "start the server there (rfm serve), or give the URL of one that runs (with TLS: grpcs:// or https://)"
+_START = (
+    "start the server there (rfm serve), or give the URL of one that runs (with TLS: grpcs:// or https://; without: "
+    "grpc:// or http://)"
+)
 _GRPC_PORT = "give that port, or http:// for the HTTP port, or grpcs:// with TLS"
 _NAME = "give the checkpoint's name with model (--model)"
 _SHOW_KEY = "show the key that it wants with api_key (--api-key-file) or headers"

@@ -164,10 +164,8 @@ class StepScorer:
     ) -> Sequence[ProgressResult]:
         request_id = next(call.request_ids)
         num_bytes = _padded_bytes(len(windows), len(sent), sent[0].nbytes if sent else 0)
-        videos, tasks = (
-            [[frame.digest for frame in window.frames] for window in windows],
-            [window.task for window in windows],
-        )
+        videos = [[frame.digest for frame in window.frames] for window in windows]
+        tasks = [window.task for window in windows]
         tensors = partial(wire.encode_refs, videos, tasks, sent)
         answer = await self._scorer.infer(self._model, num_bytes, tensors, outputs, call, request_id)
         return [

@@ -187,8 +187,8 @@ def _only(columns: Mapping[str, Any], key: str, default: Any) -> Any:
     is_by_step = isinstance(given, Sequence) and not isinstance(given, (str, bytes))
     try:
         steps = [as_array(step).tolist() for step in (given if is_by_step else [given])]
-    except ValueError as error:  # numpy's, for rows of several lengths
-        raise InvalidSampleError.at(key, "the same at all steps", error) from None
+    except ValueError as error:  # numpy's
+        raise InvalidSampleError.at(key, "one value for each step", "rows of several lengths") from error
     for values in (steps, as_array(steps[:1]).reshape(-1).tolist()):
         for value in values:
             got = f"{values[0]!r} and {value!r}"

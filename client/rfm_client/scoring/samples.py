@@ -15,11 +15,13 @@ from typing import TypeAlias, TypedDict, cast
 from rfm_client.contract import wire
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import (
+    DeadlineExceededError,
     InferenceFailedError,
     InvalidSampleError,
     InvalidValueError,
     ModelNotFoundError,
     RewardError,
+    ServerUnavailableError,
 )
 from rfm_client.contract.results import Result
 from rfm_client.contract.samples import ProgressSample, Sample, Trajectory, UInt8Array
@@ -61,7 +63,9 @@ class CallOptions(TypedDict, total=False):
 
 
 class Call:
-    """Values shared by all requests in one call. Raises ValueError for an invalid request id, TypeError for others.
+    """Values shared by all requests in one call.
+
+    Raises ValueError for an invalid request id, TypeError for an unknown option.
 
     outputs: names of outputs to request
     request_ids: yields an id for each request
@@ -247,7 +251,8 @@ class SampleScorer:
         except RewardError as error:
             if is_needed and not isinstance(error, (ModelNotFoundError, InferenceFailedError)):
                 raise
-            self._undescribed.add(model)
+            if not isinstance(error, (DeadlineExceededError, ServerUnavailableError)):
+                self._undescribed.add(model)
             return ()  # the request itself decides
 
     async def infer(

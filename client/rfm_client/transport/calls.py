@@ -128,7 +128,7 @@ class TritonTransport:
         async def request(client: Any) -> bool:
             is_ready = bool(await client.is_server_ready() and await client.is_model_ready(model))
             if is_ready and not self._is_triton:  # Triton's metrics port says over HTTP that everything is ready
-                with suppress(InferenceServerException, errors.InferenceFailedError):  # it refuses nothing
+                with suppress(InferenceServerException, errors.InferenceFailedError):  # the metrics port never refuses
                     await client.get_server_metadata()
                 self._is_triton = True
             return is_ready

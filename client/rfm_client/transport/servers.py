@@ -266,7 +266,8 @@ class Servers:
         server.failures += 1
         if error.may_have_ended_server or len(self._servers) > 1:
             rest_s = 0.0 if error.may_have_ended_server else pause_s(server.failures - 1, LONGEST_REST_S)
-            restart_s = RESTART_S if isinstance(error, ProcessEndedError) else 0.0  # Triton 2.51: the dead are ready
+            # Triton 2.51 reports a dead model as ready
+            restart_s = RESTART_S if isinstance(error, ProcessEndedError) else 0.0
             server.comeback = asyncio.create_task(server.back(model, rest_s, restart_s))
 
 

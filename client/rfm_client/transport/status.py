@@ -306,7 +306,7 @@ def _devices(metrics: _Metrics) -> tuple[Device, ...]:
     return tuple(
         Device(
             name,
-            of.get("utilization"),
+            None if of.get("memory_used_bytes") == 0 else of.get("utilization"),
             of.get("memory_used_bytes") or None,  # Triton reports zeros until it has measured
             of.get("memory_total_bytes") or None,
             {model: DeviceWork(int(d["requests"]), d["us"] / _US_PER_S) for model, d in work.get(name, {}).items()},

@@ -42,7 +42,7 @@ PROGRESS_TOKEN = "<|prog_token|>"
 # In the order in which the tokenizer gets them.
 SPECIAL_TOKENS = (SPLIT_TOKEN, REWARD_TOKEN, PREFERENCE_TOKEN, SIMILARITY_TOKEN, PROGRESS_TOKEN)
 OLD_RUN_REMEDY = (
-    "a run of before 2026-01-21 had 8 special tokens, resized images and no frame_pool_attn: score it with the "
+    "a run from before 2026-01-21 had 8 special tokens, resized images and no frame_pool_attn: score it with the "
     "upstream commit that trained it, or train it anew"
 )
 _PROGRESS_SCALE = (

@@ -106,9 +106,6 @@ def _print_tables(comparison: LabelComparison) -> None:
 def document(comparison: LabelComparison) -> dict[str, Any]:
     """Return the document for ``evaluate --json``."""
     is_success = comparison.is_success
-    numbers = [each.final_progress.tolist() for each in comparison.evaluations]
-    evaluations = [
-        {**asdict(each), "final_progress": own} for each, own in zip(comparison.evaluations, numbers, strict=True)
-    ]
+    evaluations = [{**asdict(each), "final_progress": each.final_progress.tolist()} for each in comparison.evaluations]
     arrays = {"is_success": None if is_success is None else is_success.tolist(), "evaluations": evaluations}
     return asdict(comparison) | arrays

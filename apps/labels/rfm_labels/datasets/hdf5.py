@@ -41,7 +41,7 @@ from rfm_labels.datasets.hdf5_pictures import (
     form_of,
     has_rgb_mark,
     is_encoded,
-    is_picture,
+    may_be_picture,
 )
 from rfm_labels.datasets.stored_files import digest_of
 
@@ -91,7 +91,7 @@ class _Demo:
             f"{name} is a broken link" if group is None else f"missing in {name}",
             {each: form_of(value) for each, value in observations.items()},
             faults,
-            [each for each, value in observations.items() if is_picture(value, are_pictures)],
+            [each for each, value in observations.items() if may_be_picture(value, are_pictures)],
             {each: len(value) - skipped for each, value in cameras.items()},
             {
                 each: has_rgb_mark(first_file(value))

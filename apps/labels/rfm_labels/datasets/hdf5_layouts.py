@@ -60,7 +60,7 @@ def filter_keys(opened: Any) -> Mapping[str, Sequence[int]]:
     found: dict[str, Sequence[int]] = {}
     for key, stored in members_of(opened.get("mask")).items():
         texts = texts_in(stored)
-        names = [re.fullmatch(r"demo_(\d+)", text) for text in texts or ()]
+        names = [re.fullmatch(r"demo_(0|[1-9]\d*)", text) for text in texts or ()]
         if texts is not None and None not in names:
             found[key] = sorted({int(name[1]) for name in names if name})
     return found

@@ -24,7 +24,7 @@ _RGB_MARK = b"\xff\xfe\x00\x0aXPL-RGB1"  # comment in RoboTwin's JPEG files whos
 
 
 class EncodedFrames:
-    """One camera's frames as T files. Pixels, as some of RoboMIND, are as OpenCV has them: blue first.
+    """One camera's frames as T files. RoboMIND stores some frames as pixels, blue first.
 
     stored: HDF5 dataset with T files
     where: file and path, for messages
@@ -60,7 +60,10 @@ class EncodedFrames:
                 yield Picture(file).pixels()
 
     def _whole_files(self) -> Iterator[tuple[str, bytes]]:
-        """The files after their places. Raises DatasetError for a truncated JPEG, whose zeros Pillow would decode."""
+        """Yield each file after its place, for messages.
+
+        Raises DatasetError for a truncated JPEG, whose zeros Pillow would decode.
+        """
         for t, file in enumerate(self.files()):
             where = f"{self._where}: frame {t}"
             is_whole = not file.startswith(_STARTS[0]) or file.rfind(b"\xff\xd9") > file.rfind(b"\xff\xda")
@@ -120,12 +123,12 @@ def fault_of(value: Any, are_pictures: bool) -> str:
     return what and f"{form_of(value)}, {what}"
 
 
-def is_picture(value: Any, are_pictures: bool) -> bool:
+def may_be_picture(value: Any, are_pictures: bool) -> bool:
     """True if an observation may be pictures, even in an unsupported form."""
     if value is None:  # it may have been one
         return True
     if not hasattr(value, "shape"):
-        return bool(value.visititems(lambda _, each: (hasattr(each, "shape") and is_picture(each, False)) or None))
+        return bool(value.visititems(lambda _, each: (hasattr(each, "shape") and may_be_picture(each, False)) or None))
     if len(value.shape) == 3:
         return all(size >= LEAST_SIZE_PX for size in value.shape[1:])
     return len(value.shape) > 3 or is_encoded(value, are_pictures)

@@ -207,7 +207,7 @@ def _entry_v21(info: Info, where: str, index: int, line: Mapping[str, Any]) -> E
 
 
 def _rows_v30(info: Info) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """The rows in all files, each after its file for messages."""
+    """Yield each row after its file, for messages."""
     files = sorted((info.root / EPISODES_FOLDER).rglob("*.parquet"))
     require(info.root / EPISODES_FOLDER, bool(files), "Parquet files", "none")
     of_videos = [f"videos/{key}/{name}" for key in info.videos for name in _VIDEO_COLUMNS]
@@ -275,5 +275,5 @@ def json_lines(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
 
 
 def number_in(where: str, line: Mapping[str, Any], name: str) -> int:
-    """Read a whole number, 0 or more, from a JSON line. Raises DatasetError."""
+    """Read a whole number, 0 or more, from a row. Raises DatasetError."""
     return checked_count(f"{where}: {name}", line.get(name), least=0, error=DatasetError)
