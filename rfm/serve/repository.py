@@ -143,7 +143,7 @@ def stage(repository: Path, served: Mapping[str, Config], folder: Path) -> Path:
         for path in (repository.absolute() / model).iterdir():
             if path.name != CONFIG_FILE:
                 (staged / path.name).symlink_to(path)
-        message = json_format.ParseDict(config, ModelConfig(), ignore_unknown_fields=True)
+        message = json_format.ParseDict(dict(config), ModelConfig(), ignore_unknown_fields=True)
         (staged / CONFIG_FILE).write_text(text_format.MessageToString(message))
         for path in (staged / CONFIG_FILE, staged):  # a later load takes the repository's, as they are newer
             os.utime(path, (0, 0))

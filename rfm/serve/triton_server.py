@@ -270,6 +270,7 @@ class TritonServer:
             failed = [entry for entry in index if entry.has_failed and entry.name in models]
             if failed:
                 reasons = "; ".join(f"{entry.name}: {entry.reason or 'not loaded'}" for entry in failed)
+                reasons = reasons.replace(str(self._claim.models), str(self.repository))
                 raise _failed(f"expected all to be ready, got {reasons}{_remedy(reasons)}", failed[0].name)
             check_version(self.endpoints.host, version, accepted=self.accepts_known_vulnerabilities)
             self._claim.show(self.repository)

@@ -56,12 +56,15 @@ def test_a_model_process_that_dies_or_hangs_is_restarted_and_no_call_is_lost(tmp
             if is_hung:
                 trigger.touch()
             else:
-                os.kill(served.model_processes()[0], signal.SIGKILL)
+                killed = served.model_processes()[0]
+                os.kill(killed, signal.SIGKILL)
             served.wait_ready(False, TRUTH_S + HANG_S)
             served.wait_ready()
             callers.wait_for_all()
             assert served.restarts(MODEL) == number
         assert served.reasons() == {MODEL: NO_REASON}
+        assert served.metric("rfm_serve_start_seconds") > 0
+    assert f"{MODEL}: process {killed} of it is dead (killed by SIGKILL); all models load, " in served.log.read_text()
     assert (callers.lost, callers.wrong) == ([], 0)
     assert f"Timeout (0:00:0{HANG_S})!" in served.log.read_text()
 
