@@ -16,7 +16,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -30,12 +30,9 @@ import odd_requests
 import rfm_export
 import rollout
 from callers import WIDTHS
-from engines import serve_config
 from faults import CALLERS, CHECKPOINT, FAULTS, TRITON, Row, site
 from paths import ROOT
-from rfm import published
 from rfm.config import ExportConfig
-from rfm.engine import Engine, Outcome
 from rfm_client import PreferenceSample, ProgressSample, Sample, Trajectory
 from servers import MODEL
 from trajectories import random_trajectory
@@ -67,18 +64,11 @@ def rollout_samples() -> list[Sample]:
     return samples
 
 
-def answers(checkpoint: Path, samples: Sequence[Sample]) -> list[Outcome]:
-    """Return the checkpoint's answers without a server."""
-    serve = serve_config(rollout.WITH_ENCODERS)
-    loaded = published.read(checkpoint, image_encoder=serve.image_encoder, text_encoder=serve.text_encoder)
-    return Engine.of(loaded.checkpoint, encoders=loaded.encoders()).evaluate(samples)
-
-
 def take_turns(folder: Path, arguments: argparse.Namespace) -> list[Row]:
     """Alternate rollout and rollback under gRPC and HTTP calls without retry. Each answer names its version."""
     other, samples = rollout.other_checkpoint(folder / "other"), rollout_samples()
     checkpoints = {"1": rollout.WITH_ENCODERS.checkpoint, "2": other}
-    expected = {version: answers(checkpoint, samples) for version, checkpoint in checkpoints.items()}
+    expected = {version: rollout.answers(checkpoint, samples) for version, checkpoint in checkpoints.items()}
     rows = []
     with site(folder / "rollout", lambda repository: rollout.export(checkpoints["1"], repository, MODEL)) as served:
         rollout.export(other, served.folder / "model_repository", MODEL)

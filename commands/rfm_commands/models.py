@@ -8,6 +8,7 @@ a load over HTTP makes the server's other callers wait.
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -97,8 +98,11 @@ def load(name: ExportedName, server: AdministeredRepository) -> None:
         models = models_of(server.repository, name)
         check_files(server.repository, dict.fromkeys(models))
         for model in models:
+            typer.echo(f"{model}: loading")
+            began_s = time.monotonic()
             api.load(model)
-            typer.echo(f"{model}: {', '.join(map(str, api.ready_versions(model)))} ready")
+            ready = ", ".join(map(str, api.ready_versions(model)))
+            typer.echo(f"{model}: {ready} ready after {time.monotonic() - began_s:.0f} s")
 
 
 @app.command(cls=RfmCommand)

@@ -44,7 +44,7 @@ from rfm_export.layout import description_in
 from rfm_export.pbtxt import serving_versions
 from rfm_export.publish import alone, config_of, read_config, replace_config, staging
 
-RETURN_S = 120.0
+RETURN_S = 600.0  # large checkpoints take minutes to load
 POLL_S = 1.0
 PROBE_FRAMES = 2
 PROBE_SEED = 0
@@ -133,7 +133,7 @@ class Rollout:
 
     def _go_back(self, old: Configs, served: Mapping[str, Sequence[int]]) -> str:
         """Serve the old versions again. Return the outcome in words."""
-        self.report("going back")
+        self.report(f"going back; a server that is started again has {RETURN_S:.0f} s")
         ends_s = time.monotonic() + RETURN_S
         failed: dict[str, str | None] = dict.fromkeys(reversed(list(served)))  # the ensemble before its parts
         while True:
@@ -164,7 +164,9 @@ class Rollout:
     def _serve(self, config: pb.ModelConfig, versions: Sequence[int]) -> None:
         self._write(serving_versions(config, versions))
         self.report(f"{config.name}: loading {_words(versions)}")
+        began_s = time.monotonic()
         self.server.load(config.name)
+        self.report(f"{config.name}: loaded {_words(versions)} after {time.monotonic() - began_s:.0f} s")
 
     def _write(self, config: pb.ModelConfig) -> None:
         with staging(self.repository, [config.name]) as scratch:

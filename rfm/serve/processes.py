@@ -94,7 +94,7 @@ def how_it_ended(status: int) -> str:
 UNKNOWN = ""  # model name for a process that died before the first look
 LOADING_DEAD_S = 5.0  # Triton ends a failed load within about 1 s, unless the process died before its handshake
 _PROGRAM = "triton_python_backend_stub"
-_STATES = {psutil.STATUS_ZOMBIE: "a process of it is dead", psutil.STATUS_STOPPED: "a process of it is stopped"}
+_STATES = {psutil.STATUS_ZOMBIE: "dead", psutil.STATUS_STOPPED: "stopped"}
 
 
 class ModelProcesses:
@@ -111,7 +111,7 @@ class ModelProcesses:
         self._since_s: dict[int, float] = {}  # when a process was first seen dead or stopped
 
     def fault(self, wanted: Mapping[str, int] | None = None, *, is_settled: bool = False) -> tuple[str, str] | None:
-        """Return a model whose process is dead or stopped, and which of the two.
+        """Return a model whose process is dead or stopped, and how that came about.
 
         wanted: process count by model; a dead process counts as replaced while this many live
         is_settled: no model loads or unloads: a fault counts at the second look, otherwise after LOADING_DEAD_S
@@ -126,8 +126,14 @@ class ModelProcesses:
         before, self._since_s = self._since_s, {pid: self._since_s.get(pid, now_s) for pid in ill}
         for pid in sorted(before.keys() & self._since_s.keys()):
             if is_settled or now_s - before[pid] >= LOADING_DEAD_S:
-                return self._models[pid], _STATES[states[pid]]
+                how = _how_it_died(pid) if states[pid] == psutil.STATUS_ZOMBIE else ""
+                return self._models[pid], f"process {pid} of it is {_STATES[states[pid]]}{how}"
         return None
+
+    @property
+    def has_found_any(self) -> bool:
+        """True if ``fault`` has seen a model process."""
+        return bool(self._models)
 
     def _states(self) -> dict[int, str]:
         """Return the state of each model process, and record its model."""
@@ -145,6 +151,15 @@ class ModelProcesses:
                     states[pid] = state
         self._models = {pid: model for pid, model in self._models.items() if pid in states}
         return states
+
+
+def _how_it_died(pid: int) -> str:
+    """Return how a zombie ended, in words; empty after exit status 0, and if the kernel hides it from this user."""
+    try:
+        status = int(Path(f"/proc/{pid}/stat").read_text().split()[-1])  # as from waitpid
+    except (OSError, ValueError):
+        return ""
+    return f" ({how_it_ended(os.waitstatus_to_exitcode(status))})" if status else ""
 
 
 def children_of(pid: int) -> Iterator[int]:
@@ -169,7 +184,10 @@ _LOCK = "lock"
 
 
 class Claim:
-    """A server's shared memory: the Python backend's regions, and a folder for ``Installation``.
+    """A server's shared memory: the Python backend's regions, and a folder with links for Triton.
+
+    Triton reads the models through the link ``models``: a path without spaces, which the Python backend passes to a
+    shell unquoted. ``show`` changes where it leads.
 
     This process and its children hold a lock through ``lock_file`` until the last of them ends. A process id would
     prove nothing: containers with their own process ids may share the memory.
@@ -179,18 +197,25 @@ class Claim:
         """Create the lock and the folder. Raises ServerStartError if they cannot be written."""
         name = f"{os.getpid()}_{secrets.token_hex(4)}"
         self.region_prefix = f"{REGION_PREFIX}_{name}_"
-        self.backends = SHARED_MEMORY / f"{self.region_prefix}backends"
+        self.folder = SHARED_MEMORY / f"{self.region_prefix}links"
+        self.models = self.folder / "models"
         self._lock = SHARED_MEMORY / f"{self.region_prefix}{_LOCK}"
         new_lock = SHARED_MEMORY / f"rfm-new-{name}"
         try:
             self.lock_file = os.open(new_lock, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600)
             fcntl.flock(self.lock_file, fcntl.LOCK_EX)
             new_lock.rename(self._lock)  # renamed once locked, so that ``clear_shared_memory`` never finds it unlocked
-            self.backends.mkdir(0o700)
+            self.folder.mkdir(0o700)
         except OSError as error:
             raise ServerStartError.at(
                 error.filename, "room for a server's files", error.strerror, NEEDS_ROOM
             ) from error
+
+    def show(self, repository: Path) -> None:
+        """Let Triton read the models in this folder from now on. Raises OSError."""
+        new = self.folder / "new"
+        new.symlink_to(repository.absolute())
+        new.rename(self.models)
 
     def release(self) -> None:
         """Remove the regions, the folder and the lock."""

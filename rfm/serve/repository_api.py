@@ -62,6 +62,11 @@ class ModelVersion:
         return self.state == READY
 
     @property
+    def has_failed(self) -> bool:
+        """True if the version could not be loaded; False if it loads, unloads or was unloaded on request."""
+        return self.state in (_NOT_LOADED, _UNAVAILABLE) and self.reason != _UNLOADED
+
+    @property
     def is_unloaded(self) -> bool:
         """True if the version was unloaded on request or never loaded; False if it failed to load."""
         return self.state == _NOT_LOADED or (self.state, self.reason) == (_UNAVAILABLE, _UNLOADED)

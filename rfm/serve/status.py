@@ -7,7 +7,7 @@ import json
 import socket
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -22,15 +22,17 @@ REQUEST_S = 5.0  # a connection may be silent this long
 
 
 class Status:
-    """Which models are ready, and why the others are not."""
+    """Which models are ready, and why the others are not. more: further facts about a model, for ``/ready``"""
 
-    def __init__(self) -> None:
+    def __init__(self, more: Callable[[str], Mapping[str, Any]] = lambda _model: {}) -> None:
+        self._more = more
         self._reasons: Mapping[str, str] = {}
         self._registry = CollectorRegistry()
         gauge = partial(Gauge, registry=self._registry)
         self._ready = gauge("rfm_serve_ready", "1: the model is ready.", ["model"])
         self._reason = gauge("rfm_serve_not_ready", "1: the model is not ready, and why.", ["model", "reason"])
         description = "Why Triton was started again: a model by name, or triton itself; gateway: the gateway was."
+        self.start_s = gauge("rfm_serve_start_seconds", "How long Triton's last start took.")
         self.restarts = Counter("rfm_serve_restarts", description, ["what"], registry=self._registry)
 
     def record(self, reasons: Mapping[str, str]) -> None:
@@ -56,7 +58,10 @@ class Status:
         """True if all models are ready, and the body of ``/ready``."""
         reasons = self._reasons
         is_ready = bool(reasons) and all(reason == NO_REASON for reason in reasons.values())
-        models = {model: {"ready": reason == NO_REASON, "reason": reason} for model, reason in reasons.items()}
+        models = {
+            model: {"ready": reason == NO_REASON, "reason": reason, **self._more(model)}
+            for model, reason in reasons.items()
+        }
         return is_ready, {"ready": is_ready, "models": models}
 
     def metrics(self) -> bytes:

@@ -15,8 +15,9 @@ from types import FrameType
 from rfm.serve.installation import ServerStartError
 from rfm.serve.probe import NO_ANSWER, Http
 from rfm.serve.processes import ProcessGroup, clear_shared_memory, how_it_ended, stop_signals_to
+from rfm.serve.repository import Config, versions_in, versions_in_file
 from rfm.serve.status import Status, StatusServer
-from rfm.serve.triton_server import POLL_S, Config, SpoiltStartError, TritonServer
+from rfm.serve.triton_server import POLL_S, SpoiltStartError, TritonServer
 from rfm.serve.watch import TRITON, TritonWatch
 
 GATEWAY = "gateway"
@@ -129,11 +130,12 @@ class Supervisor:
     tell_ready: Callable[[], None] | None = None
 
     def __post_init__(self) -> None:
-        self._status = Status()
+        self._status = Status(self._versions)
         self._is_to_stop = threading.Event()
         self._faults = FaultCount(STEADY_S + self.server.hang_s)
         self._watch: TritonWatch | None = None  # None: Triton is starting, or has ended
         self._served: dict[str, Config] | None = None  # configurations before the restart; None: first start
+        self._start_s = 0.0  # how long the last start took
 
     def run(self) -> None:
         """Serve until a stop signal. Raises ServerStartError for a failed start or a crash loop."""
@@ -148,6 +150,15 @@ class Supervisor:
             nullcontext() if port is None else closing(StatusServer(host, port, self._status)),
         ):
             self._serve()
+
+    def _versions(self, model: str) -> dict[str, list[int] | None]:
+        """Return a model's versions for ``/ready``: those that are served, and those that its file names."""
+        watch = self._watch
+        served = {} if watch is None else watch.served
+        return {
+            "versions": versions_in(served[model]) if model in served else [],
+            "versions_in_file": versions_in_file(self.server.repository, model),
+        }
 
     def _stop(self, number: int, _frame: FrameType | None) -> None:
         self._is_to_stop.set()
@@ -173,9 +184,12 @@ class Supervisor:
 
     def _start(self) -> None:
         """Start Triton with the versions served before (at first, the repository's). Raises ServerStartError."""
+        began_s = time.monotonic()
         self.server.start_ready(self._served)
         if self._is_to_stop.is_set():
             return
+        self._start_s = time.monotonic() - began_s
+        self._status.start_s.set(self._start_s)
         if self._served is None:
             (self.tell_ready or self._log_ready)()
         self._faults.started()
@@ -186,7 +200,7 @@ class Supervisor:
     def _log_ready(self) -> None:
         ends = self.server.endpoints
         urls = f"{ends.grpc_url}, {ends.http_url}, metrics at {ends.metrics_url}"
-        logger.info("ready: %s at %s", ", ".join(self.server.models), urls)
+        logger.info("ready after %.0f s: %s at %s", self._start_s, ", ".join(self.server.models), urls)
 
     def _look(self) -> None:
         """Restart Triton or the gateway if it ended or has a fault. Raises CrashLoopError."""
@@ -197,7 +211,8 @@ class Supervisor:
         elif self._watch.fault is not None:
             self._start_again(*self._watch.fault, counts=not self._watch.is_of_load)
         if self.gateway is not None and (why := self.gateway.look()):
-            self._count(GATEWAY, why)
+            self._status.restarts.labels(GATEWAY).inc()
+            logger.warning("%s is started again: %s", GATEWAY, why)
         if self._watch is not None and self._watch.reasons:
             self._status.record(self._watch.reasons)
 
@@ -211,13 +226,15 @@ class Supervisor:
         while not self._is_to_stop.is_set():
             self._close_watch()
             reason = why if what == TRITON else f"{what}: {why}"
-            self._status.record_down(f"{TRITON} is started again: {reason}")
+            again = f"{TRITON} is started again: {reason}; all models load, which took {self._start_s:.0f} s last time"
+            self._status.record_down(again)
             self.server.kill()
             self.server.stop()
             if counts:
                 self._faults.failed(reason)
             counts = True
-            self._count(what, why)
+            self._status.restarts.labels(what).inc()
+            logger.warning("%s", again)
             try:
                 self._start()
                 if self._watch is not None:
@@ -227,11 +244,6 @@ class Supervisor:
                 # The model from before is to blame if Triton itself crashes, but not if something outside kills Triton.
                 was_killed = self.server.exit_status == -signal.SIGKILL and not isinstance(error, SpoiltStartError)
                 what, why = error.model or (TRITON if was_killed else what), str(error)
-
-    def _count(self, what: str, why: str) -> None:
-        self._status.restarts.labels(what).inc()
-        restarted = GATEWAY if what == GATEWAY else TRITON
-        logger.warning("%s is started again: %s", restarted, why if what == restarted else f"{what}: {why}")
 
     def _close_watch(self) -> None:
         if self._watch is not None:

@@ -3,24 +3,17 @@
 
 from __future__ import annotations
 
-import json
 import mmap
 import os
 import re
 import signal
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
-from http import HTTPStatus
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any, NoReturn
-from urllib.parse import quote
-
-from google.protobuf import text_format
-from tritonclient.grpc.model_config_pb2 import ModelConfig
+from typing import IO, NoReturn
 
 from rfm.parameters import DEFAULT_HANG_S, HANG_VARIABLE
 from rfm.serve.access import Endpoints, check_version, http_headers, new_key, restrictions
@@ -36,7 +29,7 @@ from rfm.serve.processes import (
     how_it_ended,
     stop_signals_to,
 )
-from rfm.serve.repository import CONFIG_FILE, check_models, models_in, no_models
+from rfm.serve.repository import Config, check_models, models_in, no_models, stage
 from rfm.serve.repository_api import INDEX_PATH, versions_of
 
 MAX_HTTP_BYTES = 256 * 2**20  # for a request body; gRPC accepts 2 GiB
@@ -101,8 +94,8 @@ _REMEDIES = {  # by pattern in the reason why a model is not loaded
     "No space left on device": NEEDS_ROOM,
 }
 _DIED = "Stub process .* is not healthy"  # Triton's words for a process that died during a load
+_REPOSITORY = "--model-repository="
 _REGIONS = "--backend-config=python,shm-region-prefix-name="
-Config = Mapping[str, Any]  # a model's configuration in Triton's JSON
 
 
 def short_spin(environment: Mapping[str, str]) -> dict[str, str]:
@@ -219,40 +212,28 @@ class TritonServer:
         self.stop()
 
     def _start_ready(self, served: Mapping[str, Config] | None) -> None:
-        """Start Triton with ``served``, or with all models if None, and wait until they are ready.
-
-        If every model's file names the versions in ``served``, Triton starts with the models. Otherwise Triton starts
-        without models, and then loads each with its configuration in ``served``.
-        """
+        """Start Triton with ``served``, or with all models if None, and wait until they are ready."""
         there = self.models
         if not there:
             raise ServerStartError(no_models(self.repository))
-        if len(str(self.repository).split()) > 1:  # Triton's Python backend passes the path to a shell unquoted
-            expected = "a path without spaces, such as a link (ln -s)"
-            raise ServerStartError.at("repository", expected, self.repository)
-        as_in_file = there
-        if served is not None:
-            as_in_file = [name for name in served if _names_the_same_versions(self.repository, name, served[name])]
-            if len(as_in_file) < len(served):  # an ensemble would load its parts from their files
-                as_in_file = []
         if served is None:  # later, a file that cannot be read for a moment must not cost a model
             check_models(self.repository, there)
-        self._start(sorted(as_in_file))
-        self._wait_ready(as_in_file)
-        others = {name: served[name] for name in served.keys() - set(as_in_file)} if served else {}
-        for name in sorted(others, key=lambda name: "ensemble_scheduling" in others[name]):
-            self._load(name, others[name])
+        models = sorted(there if served is None else served)
+        self._start(models, served)
+        self._wait_ready(models)
 
-    def _start(self, models: Sequence[str]) -> None:
+    def _start(self, models: Sequence[str], served: Mapping[str, Config] | None) -> None:
         """Start the process with ``models``. Raises ServerStartError for wrong arguments, addresses or files."""
         own = self._arguments(models)
-        check_arguments(self.more_arguments, [*own, _REGIONS])
+        check_arguments(self.more_arguments, [*own, _REPOSITORY, _REGIONS])
         if self.installation.wheel is not None:
             check_version(self.endpoints.host, WHEEL_VERSION, accepted=self.accepts_known_vulnerabilities)
         self.endpoints.check()
         self._claim = Claim()
-        arguments = [*own, f"{_REGIONS}{self._claim.region_prefix}"]
-        arguments += self.installation.lay_out_backends(self._claim.backends)
+        staged = self.repository if served is None else stage(self.repository, served, self._claim.folder / "staged")
+        self._claim.show(staged)
+        arguments = [*own, f"{_REPOSITORY}{self._claim.models}", f"{_REGIONS}{self._claim.region_prefix}"]
+        arguments += self.installation.lay_out_backends(self._claim.folder / "backends")
         arguments += self.endpoints.grpc_tls.arguments() if self.endpoints.grpc_tls else []
         if self.log is None and not any(each.startswith("--log-") for each in self.more_arguments):
             arguments += ["--log-info=false"]
@@ -275,39 +256,27 @@ class TritonServer:
 
     def _wait_ready(self, models: Collection[str]) -> None:
         """Wait until ``models`` are ready. Raises ServerStartError with the reason for each failed model."""
+        assert self._claim is not None  # started
         processes, ends_s = ModelProcesses(self.pid), time.monotonic() + LOAD_S
         while (status := self.exit_status) is None:
+            if processes.has_found_any:  # Triton has read all configurations; from now on it reads those in the files
+                self._claim.show(self.repository)
             try:
                 version = self.http.json("/v2", ANSWER_TIMEOUT_S).get("version", "")
-                index = self.http.json(INDEX_PATH, ANSWER_TIMEOUT_S, "POST")
+                index = versions_of(self.http.json(INDEX_PATH, ANSWER_TIMEOUT_S, "POST"))
             except NO_ANSWER:  # usual while Triton loads
                 self._pause(processes, ends_s)
                 continue
-            failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in models]
+            failed = [entry for entry in index if entry.has_failed and entry.name in models]
             if failed:
                 reasons = "; ".join(f"{entry.name}: {entry.reason or 'not loaded'}" for entry in failed)
+                reasons = reasons.replace(str(self._claim.models), str(self.repository))
                 raise _failed(f"expected all to be ready, got {reasons}{_remedy(reasons)}", failed[0].name)
             check_version(self.endpoints.host, version, accepted=self.accepts_known_vulnerabilities)
+            self._claim.show(self.repository)
             return
         kind = SpoiltStartError if status == -signal.SIGABRT else ServerStartError
         raise kind(f"tritonserver: expected to run, got {how_it_ended(status)}")
-
-    def _load(self, name: str, config: Config) -> None:
-        """Load a model with this configuration, over HTTP: the gRPC port may require a certificate."""
-        body = json.dumps({"parameters": {"config": json.dumps(config)}}).encode()
-        path = f"/v2/repository/models/{quote(name, safe='')}/load"
-        processes, ends_s = ModelProcesses(self.pid), time.monotonic() + LOAD_S
-        with ThreadPoolExecutor(1, "rfm-load") as thread:
-            answer = thread.submit(self.http.request, "POST", path, LOAD_S, body)
-            while not answer.done():
-                self._pause(processes, ends_s)
-        try:
-            status, text = answer.result()
-        except NO_ANSWER as error:
-            model = name if self.exit_status is None else None  # else Triton itself has ended
-            raise ServerStartError(f"expected {name} to load, got: {error}", "models", model) from error
-        if status != HTTPStatus.OK:
-            raise _failed(f"expected {name} to load, got: {text}", name)
 
     def _pause(self, processes: ModelProcesses, ends_s: float) -> None:
         """Wait for POLL_S. Kill Triton and raise SpoiltStartError if a model process is dead, or after ``ends_s``."""
@@ -321,7 +290,6 @@ class TritonServer:
 
     def _arguments(self, models: Sequence[str]) -> list[str]:
         return [
-            f"--model-repository={self.repository}",
             "--model-control-mode=explicit",
             *(f"--load-model={model}" for model in models),
             "--disable-auto-complete-config",
@@ -345,17 +313,6 @@ def _failed(problem: str, model: str) -> ServerStartError:
 
 def _remedy(reasons: str) -> str:
     return next((f"; {remedy}" for pattern, remedy in _REMEDIES.items() if re.search(pattern, reasons)), "")
-
-
-def _names_the_same_versions(repository: Path, model: str, config: Config) -> bool:
-    """True if the model's file names the same versions as ``config``, or no versions."""
-    try:
-        file = text_format.Parse((repository / model / CONFIG_FILE).read_text(), ModelConfig())
-    except (OSError, UnicodeDecodeError, text_format.ParseError):
-        return False
-    if not file.version_policy.HasField("specific"):  # another program's model
-        return True
-    return bool(list(file.version_policy.specific.versions) == config["version_policy"]["specific"]["versions"])
 
 
 @contextmanager

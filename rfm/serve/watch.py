@@ -18,9 +18,10 @@ from urllib.parse import quote
 
 from rfm.serve.probe import NO_ANSWER, Http, Probe, can_be_probed
 from rfm.serve.processes import ModelProcesses
+from rfm.serve.repository import Config
 from rfm.serve.repository_api import INDEX_PATH, LOADING, UNLOADING, ModelVersion, versions_of
 from rfm.serve.status import NO_REASON
-from rfm.serve.triton_server import Config, TritonServer
+from rfm.serve.triton_server import TritonServer
 from rfm_client.contract.description import num_instances
 
 LOOK_S = 0.5

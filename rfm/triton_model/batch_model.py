@@ -59,7 +59,7 @@ class BatchModel(Generic[Question, Answer]):
         settings = {name: value["string_value"] for name, value in config["parameters"].items()}
         description = Description.parse(settings.get(DESCRIPTION_PARAMETER, ""))
         placement = Placement.of(args, config, settings)
-        version = Path(args["model_repository"], args["model_version"])
+        version = Path(args["model_repository"], args["model_version"]).resolve()  # `rfm serve` hands it a link
         self._pipeline: Pipeline | None = None
         self._is_executing = False
         self._batch_s = 0.0  # duration of the last batch

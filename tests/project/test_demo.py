@@ -102,16 +102,6 @@ def test_a_checkpoint_of_one_s_own_scores_a_video(tmp_path: Path, monkeypatch: p
     assert (tmp_path / "rewards.png").read_bytes().startswith(PNG)
 
 
-def test_rfm_try_refuses_a_repository_whose_path_has_spaces(tmp_path: Path) -> None:
-    clip.write(tmp_path / "clip.mp4")
-    spaced = tmp_path / "my models"
-    spaced.symlink_to(REPOSITORY)
-    result = rfm("try", tmp_path / "clip.mp4", "--task", "x", "--repository", spaced, "--output", tmp_path)
-    assert result.exit_code == 1
-    expected = "a path without spaces, such as a link (ln -s)"
-    assert result.stderr.startswith(f"rfm: repository: expected {expected}, got {spaced}")
-
-
 @pytest.mark.nightly
 def test_training_is_reproducible_and_its_result_is_served_as_any_checkpoint(tmp_path: Path) -> None:
     steps = ("--encoder-steps", 2, "--frozen-steps", 1, "--joint-steps", 1, "--groups", 1)

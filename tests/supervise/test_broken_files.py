@@ -15,7 +15,7 @@ from in_process import rfm
 from repositories import changing
 from rfm.parameters import EXPORT_PARAMETER, FAMILY_PARAMETER
 from rfm.serve.installation import ServerStartError
-from rfm.serve.repository import fault_in
+from rfm.serve.repository import fault_in, stage, versions_in_file
 from rfm.serve.triton_server import TritonServer
 from rfm_client.contract.description import DESCRIPTION_PARAMETER
 from servers import Endpoints, find_installation
@@ -81,6 +81,30 @@ def test_a_model_with_broken_files_is_refused_before_a_running_server_loads_it(t
     done = rfm("models", "load", "rfm", f"--repository={repository}", "--url=grpc://127.0.0.1:1")
     assert done.exit_code == 1
     assert done.stderr.startswith(f"rfm: {repository}/rfm/1/model.py: expected the model's program, got none; ")
+
+
+SERVED = {"a": [1, 2], "b": [1]}
+STAGED: dict[str, tuple[dict[str, str], bool]] = {  # what the files name, and does a restart read them
+    "as served": ({"a": "versions: 1\n  versions: 2", "b": "versions: 1"}, True),
+    "a rollout went back": ({"a": "versions: 1", "b": "versions: 1"}, True),
+    "a rollout has ended": ({"a": "versions: 2", "b": "versions: 1"}, True),
+    "a new export": ({"a": "versions: 1", "b": "versions: 2"}, False),
+    "unreadable": ({"a": "versions: 1", "b": "version"}, False),
+}
+
+
+@pytest.mark.parametrize("name", STAGED)
+def test_a_restart_reads_files_that_name_only_versions_that_were_served(tmp_path: Path, name: str) -> None:
+    files, is_read = STAGED[name]
+    repository, folder = tmp_path / "models", tmp_path / "staged"
+    for model, versions in files.items():
+        (repository / model / "1").mkdir(parents=True)
+        (repository / model / "config.pbtxt").write_text(f"version_policy {{ specific {{ {versions} }} }}")
+    served = {model: {"version_policy": {"specific": {"versions": each}}} for model, each in SERVED.items()}
+    assert stage(repository, served, folder) == (repository if is_read else folder)
+    if not is_read:
+        assert {model: versions_in_file(folder, model) for model in SERVED} == SERVED
+        assert (folder / "a" / "1").samefile(repository / "a" / "1")
 
 
 def test_a_model_of_another_program_needs_only_the_files_that_triton_needs(tmp_path: Path) -> None:

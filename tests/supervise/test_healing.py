@@ -15,7 +15,7 @@ import pytest
 
 import stand_in_triton
 from callers import Callers, Exam, direct
-from commands import is_alive, running
+from commands import is_alive, running, running_models
 from repositories import answering, make_repository
 from rfm.serve.processes import SHARED_MEMORY, clear_shared_memory
 from rfm.serve.status import NO_REASON
@@ -44,7 +44,7 @@ def test_a_model_process_that_dies_or_hangs_is_restarted_and_no_call_is_lost(tmp
     """tests/supervise/test_supervisor.py has the other faults."""
     trigger = tmp_path / "trigger"
     once = f"os.path.exists({str(trigger)!r}) and os.unlink({str(trigger)!r}) is None"
-    repository = make_repository(tmp_path, answering(f"if {once}: time.sleep(3600)"))
+    repository = make_repository(tmp_path / "a folder; with spaces", answering(f"if {once}: time.sleep(3600)"))
     exam = Exam.of(repository / MODEL / "1" / "checkpoint", mixed=True)
     with (
         administered(repository, hang_s=HANG_S) as served,
@@ -56,12 +56,15 @@ def test_a_model_process_that_dies_or_hangs_is_restarted_and_no_call_is_lost(tmp
             if is_hung:
                 trigger.touch()
             else:
-                os.kill(served.model_processes()[0], signal.SIGKILL)
+                killed = served.model_processes()[0]
+                os.kill(killed, signal.SIGKILL)
             served.wait_ready(False, TRUTH_S + HANG_S)
             served.wait_ready()
             callers.wait_for_all()
             assert served.restarts(MODEL) == number
         assert served.reasons() == {MODEL: NO_REASON}
+        assert served.metric("rfm_serve_start_seconds") > 0
+    assert f"{MODEL}: process {killed} of it is dead (killed by SIGKILL); all models load, " in served.log.read_text()
     assert (callers.lost, callers.wrong) == ([], 0)
     assert f"Timeout (0:00:0{HANG_S})!" in served.log.read_text()
 
@@ -73,7 +76,7 @@ def test_a_start_is_repeated_when_a_model_process_is_killed(tmp_path: Path) -> N
 
     def kill_first() -> set[int]:
         wait_for(begun.exists)
-        processes = running(f"{repository}/{MODEL}/", 2)  # this process may have started other servers
+        processes = running_models(repository, MODEL)
         for pid in processes:
             os.kill(pid, signal.SIGKILL)
         return processes
@@ -105,7 +108,7 @@ def test_a_killed_server_without_a_log_leaves_nothing_running_and_the_next_remov
     served = Serving(killed, ends, f"http://127.0.0.1:{more.http_port}", tmp_path / "log")
 
     def model() -> set[int]:
-        return running(f"{repository}/{MODEL}/", 2)
+        return running_models(repository, MODEL)
 
     def gateway() -> set[int]:
         return running("rfm_gateway", 3) & running(f"{more.grpc_port}")

@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+import os
+import re
 import shutil
+import signal
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 import safetensors.torch
+from tritonclient.grpc.model_config_pb2 import ModelConfig
 from typer.testing import Result
 
 import goldens
@@ -19,7 +23,7 @@ from engines import load_engine, serve_config
 from in_process import rfm
 from reward_models import ROOT
 from rfm.config import ExportConfig
-from rfm.serve.repository_api import RepositoryApiError
+from rfm.serve.repository_api import RepositoryApi, RepositoryApiError
 from rfm_client import ModelNotFoundError, ProgressSample, RewardClient, ServerError
 from rfm_commands import rollout as rfm_rollout
 from rfm_commands.rollout import Rollout, RolloutError
@@ -135,7 +139,7 @@ def test_a_broken_version_is_never_asked_and_a_good_one_is_rolled_out(running: R
     """No call is lost, and the other models stay."""
     name, sample = "fragile", ProgressSample(random_trajectory(1, 5))
     running.export_plain(name)
-    assert running.models("load", name) == f"{name}: 1 ready\n"
+    assert re.fullmatch(f"{name}: loading\n{name}: 1 ready after \\d+ s\n", running.models("load", name))
     running.export_plain(name, rollout.other_checkpoint(tmp_path / "other", PLAIN.checkpoint))
     expected = load_engine(PLAIN.name).evaluate([sample])
     weights = running.repository / name / "2" / "checkpoint" / "model.safetensors"
@@ -163,6 +167,49 @@ def test_a_broken_version_is_never_asked_and_a_good_one_is_rolled_out(running: R
     assert ["rfm_frames", "1", "READY"] in listed
     with running.client(name) as client, pytest.raises((ModelNotFoundError, ServerError)):
         client.progress(random_trajectory(0, 3))
+
+
+def test_a_crash_before_or_in_a_rollout_leaves_the_versions_that_were_served(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Callers are told to ask again, and the rollout leaves no second version loaded."""
+    repository, sample = tmp_path / "repository", ProgressSample(random_trajectory(1, 5, *rollout.WIDTHS))
+    other = rollout.other_checkpoint(tmp_path / "other")
+    rollout.export(WITH_ENCODERS.checkpoint, repository)
+    expected = {
+        version: rollout.answers(checkpoint, [sample])
+        for version, checkpoint in {"1": WITH_ENCODERS.checkpoint, "2": other}.items()
+    }
+    with administered(repository) as served, served.api() as api:
+        rollout.export(other, repository)
+        running = Running(served, repository)
+
+        def crash_at_last(server: RepositoryApi, config: ModelConfig, version: int) -> None:
+            probe(server, config, version)
+            if config.name == "rfm":  # both parts serve both versions
+                os.kill(served.triton, signal.SIGKILL)
+                probe(server, config, version)
+
+        def versions() -> dict[str, tuple[list[int], list[int]]]:
+            state = served.ready().json()["models"]
+            return {part: (state[part]["versions"], state[part]["versions_in_file"]) for part in PARTS}
+
+        with callers(served.endpoints.grpc_url, [sample], expected) as tally:
+            os.kill(served.triton, signal.SIGKILL)
+            wait_for(lambda: served.restarts("triton") == 1)
+            served.wait_ready()
+            assert versions() == dict.fromkeys(PARTS, ([1], [2]))
+            probe = rfm_rollout.probe
+            monkeypatch.setattr(rfm_rollout, "probe", crash_at_last)
+            with pytest.raises(RolloutError, match="served as before: rfm_encoder: version 1; rfm: version 1; "):
+                Rollout(repository, NAME, api, lambda line: None).to(2)
+            monkeypatch.setattr(rfm_rollout, "probe", probe)
+            wait_for(lambda: versions() == dict.fromkeys(PARTS, ([1], [1])), told=versions)
+            assert running.models("rollout", NAME, "2").endswith(f"{NAME}: version 2 is served\n")
+            wait_for(lambda: tally.by_version["2"])
+        wait_for(lambda: versions() == dict.fromkeys(PARTS, ([2], [2])))
+    assert tally.unlike == []
+    assert {error.partition("(")[0] for error in tally.failed} == {"ServerUnavailableError"}
 
 
 @dataclass

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-import json
 import os
+import re
 import signal
 import socket
 import sys
@@ -21,7 +21,7 @@ import httpx
 import pytest
 
 import stand_in_triton
-from commands import running
+from commands import running_models
 from rfm.serve import probe, processes, status, supervisor, triton_server, watch
 from rfm.serve.processes import LOADING_DEAD_S, UNKNOWN, ModelProcesses
 from rfm.serve.status import NO_REASON, Status, StatusServer
@@ -61,7 +61,7 @@ class Supervised:
 
     def signal(self, number: signal.Signals, model: str = "") -> None:
         """Send a signal to Triton, or to a model's process."""
-        for pid in running(f"{self.repository}/{model}/", 2) if model else [self.server.pid]:
+        for pid in running_models(self.repository, model) if model else [self.server.pid]:
             os.kill(pid, number)
 
 
@@ -94,8 +94,12 @@ def supervised(folder: Path, *models: str) -> Iterator[Supervised]:
 
 Act = Callable[[Supervised], None]
 FAULTS: dict[str, tuple[Act, str, str]] = {
-    "a process dies": (lambda s: s.signal(signal.SIGKILL, "a"), "a", "a: a process of it is dead"),
-    "a process stops": (lambda s: s.signal(signal.SIGSTOP, "a"), "a", "a: a process of it is stopped"),
+    "a process dies": (
+        lambda s: s.signal(signal.SIGKILL, "a"),
+        "a",
+        r"a: process \d+ of it is dead \(killed by SIGKILL\)",
+    ),
+    "a process stops": (lambda s: s.signal(signal.SIGSTOP, "a"), "a", r"a: process \d+ of it is stopped"),
     "triton dies": (lambda s: s.signal(signal.SIGKILL), "triton", "killed by SIGKILL"),
     "requests fail": (lambda s: s.file("fails").touch(), "a", "a: it has failed at 3 probes in a row"),
     "triton is silent": (lambda s: s.signal(signal.SIGSTOP), "triton", f"no answer for {SILENT_S:g} s"),
@@ -119,7 +123,8 @@ def test_triton_is_started_again_after_each_fault(tmp_path: Path, caplog: pytest
         stage.serving.wait_ready()
         assert stage.serving.reasons() == {"a": NO_REASON}
         assert stage.server.pid != before
-    assert f"triton is started again: {why}" in caplog.messages
+    (line,) = [line for line in caplog.messages if line.startswith("triton is started again")]
+    assert re.fullmatch(rf"triton is started again: {why}; all models load, which took \d+ s last time", line)
     assert [message.startswith("ready again after ") for message in caplog.messages].count(True) == 1
 
 
@@ -143,7 +148,8 @@ def test_faults_in_a_row_end_the_supervisor(tmp_path: Path, monkeypatch: pytest.
         assert httpx.get(f"{stage.serving.status_url}/live").status_code == 200
         assert httpx.get(f"{stage.serving.status_url}/other").status_code == 404
         stage.file("deadly-a").touch()
-        wanted = r"^triton: expected to run, got 2 faults in a row; the last: a: a process of it is dead$"
+        last = r"a: process \d+ of it is dead"
+        wanted = f"^triton: expected to run, got 2 faults in a row; the last: {last}$"
         with pytest.raises(CrashLoopError, match=wanted):
             stage.ended.result()
 
@@ -223,10 +229,12 @@ def test_a_restart_serves_the_same_models_and_versions_and_no_newer_export(tmp_p
         wait_for(lambda: stage.serving.restarts("triton") == 1)
         stage.serving.wait_ready()
         assert stage.serving.reasons() == {"a": NO_REASON, "c": NO_REASON}
-        loaded = {model: json.loads(stage.file(f"loaded-{model}").read_text()) for model in ("a", "c")}
-    for model, body in loaded.items():
-        told = json.loads(body["parameters"]["config"])
-        assert (told["name"], told["version_policy"]) == (model, {"specific": {"versions": [1]}})
+        (state, _) = (stage.serving.ready().json()["models"][model] for model in ("a", "c"))
+        assert (state["versions"], state["versions_in_file"]) == ([1], [2])
+        for model in ("a", "c"):
+            assert "versions: 1" in stage.file(f"loaded-{model}").read_text()
+        httpx.post(f"{stage.serving.endpoints.http_url}/v2/repository/models/a/load")
+        assert stage.file("loaded-a").read_text() == config.read_text()  # a later load reads the repository's files
 
 
 def test_a_silent_gateway_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:

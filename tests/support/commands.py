@@ -60,6 +60,13 @@ def running(words: str, most: int | None = None) -> set[int]:
     return {process.pid for process in each if words in " ".join((process.info["cmdline"] or [])[:most])}
 
 
+def running_models(repository: Path, model: str) -> set[int]:
+    """Return the ids of a model's processes below all servers of ``repository``."""
+    links = SHARED_MEMORY.glob(f"{REGION_PREFIX}_*_links/models")
+    served = [link for link in links if link.resolve() == repository.resolve()]
+    return {pid for link in served for pid in running(f"{link}/{model}/", 2)}
+
+
 def tritons() -> set[int]:
     """Return the ids of all tritonservers of this test run."""
     return {pid for pid in running("tritonserver", 1) if is_ours(pid)}

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from tritonclient.grpc.model_config_pb2 import ModelConfig
 
-from commands import REPOSITORY, running
+from commands import REPOSITORY, running_models
 from rfm_client.contract.description import Description
 from rfm_export.layout import CONFIG_FILE, description_in
 from rfm_export.pbtxt import parse, render
@@ -62,8 +62,7 @@ def bound_queue(model: Path, max_queue_size: int) -> None:
 
 def kill_model(repository: Path, model: str = "rfm") -> None:
     """Kill all processes of a model in ``repository``."""
-    model_file = f"{repository}/{model}/1/model.py"
-    killed = running(model_file)
+    killed = running_models(repository, model)
     assert killed
     for pid in killed:
         with suppress(ProcessLookupError):  # it has ended meanwhile

@@ -23,7 +23,8 @@ import goldens
 import rfm_export
 from callers import numbers
 from engines import serve_config
-from rfm.engine import Outcome
+from rfm import published
+from rfm.engine import Engine, Outcome
 from rfm_client import (
     AsyncRewardClient,
     DeadlineExceededError,
@@ -84,6 +85,13 @@ def other_checkpoint(folder: Path, source: Path = WITH_ENCODERS.checkpoint) -> P
 
 def export(checkpoint: Path, repository: Path, name: str = NAME) -> int:
     return rfm_export.export(checkpoint, repository, serve_config(WITH_ENCODERS, name))
+
+
+def answers(checkpoint: Path, samples: Sequence[Sample]) -> list[Outcome]:
+    """Return the checkpoint's answers without a server."""
+    serve = serve_config(WITH_ENCODERS)
+    loaded = published.read(checkpoint, image_encoder=serve.image_encoder, text_encoder=serve.text_encoder)
+    return Engine.of(loaded.checkpoint, encoders=loaded.encoders()).evaluate(samples)
 
 
 def difference(left: object, right: object) -> float:

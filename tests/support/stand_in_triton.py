@@ -2,8 +2,8 @@
 """A Triton that starts at once, has real model processes, and answers what ``rfm serve`` asks.
 
 Empty files in the folder above the repository change it: ``hangs`` and ``fails`` say what becomes of probes, ``busy``
-lets the count of requests grow. A model with the file ``loading-MODEL`` also loads a version 2. What a load asked for
-is in ``loaded-MODEL``.
+lets the count of requests grow. A model with the file ``loading-MODEL`` also loads a version 2. The configuration that
+the last load read is in ``loaded-MODEL``.
 """
 
 from __future__ import annotations
@@ -29,11 +29,13 @@ CONFIG_FILE = 'name: "%s"\nbackend: "python"\nversion_policy { specific { versio
 
 class Answer(BaseHTTPRequestHandler):
     repository = Path()
+    folder = Path(__file__).parent  # above the repository
     processes: dict[str, subprocess.Popen[bytes]] = {}  # noqa: RUF012  of all connections
     count = 0
 
     @classmethod
     def load(cls, model: str) -> None:
+        (cls.folder / f"loaded-{model}").write_text((cls.repository / model / "config.pbtxt").read_text())
         words = ["triton_python_backend_stub", str(cls.repository / model / "1" / "model.py")]
         cls.processes[model] = subprocess.Popen(words, executable=sys.executable)
         with suppress(OSError):  # the log has no room
@@ -49,13 +51,12 @@ class Answer(BaseHTTPRequestHandler):
             self._reply(200, told)
 
     def do_POST(self) -> None:
-        body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        self.rfile.read(int(self.headers.get("Content-Length", 0)))
         if self.path == "/v2/repository/index":
             self._reply(200, [entry for folder in self.repository.iterdir() for entry in self._versions(folder.name)])
         elif self.path.endswith(("/load", "/unload")):
             *_, model, what = self.path.split("/")
             if what == "load":
-                (self.repository.parent / f"loaded-{model}").write_bytes(body)
                 self.load(model)
             else:
                 process = self.processes.pop(model)
@@ -74,7 +75,7 @@ class Answer(BaseHTTPRequestHandler):
         return [{"name": model, "version": "1", "state": "READY"}, *loading]
 
     def _is(self, name: str) -> bool:
-        return (self.repository.parent / name).exists()
+        return (self.folder / name).exists()
 
     def _reply(self, status: int, content: Any) -> None:
         body = (content if isinstance(content, str) else json.dumps(content)).encode()
