@@ -194,7 +194,7 @@ def test_a_label_file_that_cannot_be_replaced_is_named_with_those_that_are_new(o
     with pytest.raises(
         OSError, match=rf"{FILES[1]}: cannot be replaced: Is a directory; .*{FILES[0]} is new already: make"
     ):
-        label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output, limit=1, **FEW))
+        label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output, limit=1, overwrite=True, **FEW))
     assert (output / FILES[0]).is_file()
 
 

@@ -21,6 +21,8 @@ from rfm.serve.installation import ServerStartError
 from rfm.serve.processes import children_of
 from rfm.serve.triton_server import TritonServer
 from rfm_client.options import ConfigError
+from rfm_commands.serve_screen import ServeScreen, doors
+from rfm_gateway import GatewayConfig
 from secured import Papers
 from servers import wait_for
 
@@ -80,6 +82,34 @@ def test_files_of_tls_are_read_before_anything_starts(papers: Papers) -> None:
             replace(Endpoints.free(), grpc_tls=tls).check()
     with pytest.raises(ConfigError, match=r"^grpc_client_ca needs grpc_certificate$"):
         ServeConfig(grpc_client_ca=papers.ca)
+
+
+ASKS: dict[str, tuple[bool, list[str], dict[str, str]]] = {
+    "nothing": (False, [], {}),
+    "client certificates": (True, [], {"gRPC": "a client certificate"}),
+    "keys of tritonserver": (
+        False,
+        ["--grpc-restricted-protocol=health,inference:a=b", "--http-restricted-api=inference:a=b"],
+        {"gRPC": "a key", "HTTP": "a key"},
+    ),
+    "a key for health alone": (False, ["--grpc-restricted-protocol=health:inference=b"], {}),
+}
+
+
+@pytest.mark.parametrize(("has_tls", "more", "asks"), ASKS.values(), ids=ASKS)
+def test_the_screen_says_what_each_port_asks_for_and_shows_it_in_the_next_step(
+    papers: Papers, capsys: pytest.CaptureFixture[str], has_tls: bool, more: list[str], asks: dict[str, str]
+) -> None:
+    tls = GrpcTls(papers.certificate, papers.key, papers.ca) if has_tls else None
+    endpoints, gateway = replace(Endpoints.free(), grpc_tls=tls), GatewayConfig(host="127.0.0.1", port=8100)
+    found = doors(endpoints, more, 8003, gateway, {"RFM_GATEWAY_API_KEY": "open sesame"})
+    of_all = {**dict.fromkeys(("gRPC", "HTTP", "metrics", "status"), "no key"), "page": "a key"}
+    assert {name: kind for name, (_, kind) in found.items()} == {**of_all, **asks}
+    ServeScreen(REPOSITORY, endpoints, found, Path("triton.log")).show_ready()
+    shown = capsys.readouterr().err
+    assert f"  gRPC     {endpoints.grpc_url} (asks for {asks.get('gRPC', 'no key')})\n" in shown
+    own = " --ca-file AUTHORITY.pem --client-certificate CERTIFICATE.pem --client-key KEY.pem" * has_tls
+    assert f"score VIDEO --task TASK --url {endpoints.grpc_url}{own}\n" in shown
 
 
 def test_http_beside_tls_listens_on_loopback_alone(papers: Papers) -> None:
