@@ -198,7 +198,7 @@ def _temporary(target: Path) -> Iterator[Path]:
     The name is fixed, so that a repeated run overwrites what a killed run left. It is a random one while another run
     writes the same target, or if the file system has no locks.
     """
-    file = target.with_name(f".{target.name}.tmp")
+    file = target.with_name(f".{target.name}.{os.getuid()}.tmp")  # this user can overwrite it
     with ExitStack() as files:
         opened = files.enter_context(file.open("ab"))
         if not _locked(file, opened):
@@ -225,7 +225,10 @@ def _locked(file: Path, opened: IO[bytes]) -> bool:
 
 def _is_at(file: Path, opened: IO[bytes]) -> bool:
     """True if the open file has this path."""
-    return file.exists() and os.path.samestat(file.stat(), os.fstat(opened.fileno()))
+    try:
+        return os.path.samestat(file.stat(), os.fstat(opened.fileno()))
+    except FileNotFoundError:
+        return False
 
 
 def _progress_form(plan: Plan, columns: Sequence[str]) -> Form:
