@@ -36,8 +36,7 @@ def test_rfm_serve_refuses_an_exposed_host_with_a_vulnerable_triton_unless_accep
     assert "--accept-known-vulnerabilities" in done.stderr
     assert rfm("serve", "/nowhere", "--host", "0.0.0.0", "--accept-known-vulnerabilities").exit_code == 1
     accepted = "0.0.0.0 is no loopback address, and a Triton with known remote vulnerabilities is accepted"
-    first, *_ = (message for message in caplog.messages if not message.startswith("removed /dev/shm"))  # of others
-    assert first.startswith(accepted)
+    assert any(message.startswith(accepted) for message in caplog.messages)
 
 
 def test_an_older_triton_that_listens_elsewhere_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
