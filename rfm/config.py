@@ -171,6 +171,7 @@ class ServeConfig(Settings):
     )
     grpc_key: Path | None = setting(None, "The certificate's key (PEM).")
     grpc_client_ca: Path | None = setting(None, "Require client certificates from these authorities (PEM) over gRPC.")
+    grpc_any_client: bool = setting(False, "Beyond loopback, too, let clients without a certificate use gRPC with TLS.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -178,6 +179,11 @@ class ServeConfig(Settings):
         ConfigError.require_both(self, "grpc_certificate", "grpc_key")
         if self.grpc_client_ca is not None and self.grpc_certificate is None:
             raise ConfigError.of_two("grpc_client_ca", "needs", "grpc_certificate")
+        if self.grpc_certificate and not (self.grpc_client_ca or self.grpc_any_client or self.is_loopback):
+            expected = (
+                f"client certificates (--grpc-client-ca) at {self.host}, since TLS alone asks callers for nothing"
+            )
+            raise ConfigError.at("grpc_certificate", expected, "none", "--grpc-any-client serves everyone")
 
     @property
     def is_loopback(self) -> bool:

@@ -17,7 +17,7 @@ import typer
 
 from rfm.config import ExportConfig, ServeConfig
 from rfm.serve.access import Endpoints, new_key, take_key
-from rfm.serve.installation import ServerStartError, find_installation
+from rfm.serve.installation import ServerStartError, find_installation, has_gpu, without_gpus
 from rfm.serve.supervisor import CrashLoopError, GatewayProcess, Supervisor
 from rfm.serve.triton_server import TritonServer, short_spin
 from rfm_client.cli.command import MOST_COLUMNS, OptionValues, with_options
@@ -34,11 +34,11 @@ try:
     )  # before the modules below, which import it
 except ModuleNotFoundError:
     raise SystemExit("rfm: expected the package rfm-gateway, got none: pip install ./client ./apps/gateway .") from None
-from rfm_commands.command import AdminKeyFile, RfmCommand, RfmCommands, TritonPath, fail, say
+from rfm_commands.command import AdminKeyFile, RfmCommand, RfmCommands, TritonPath, fail, say, timed_steps
 from rfm_commands.config import Config, GatewayBeside, named_as_typed
 from rfm_commands.models import app as models_app
 from rfm_commands.rollout import names_of
-from rfm_commands.serve_screen import ServeScreen, log_file, opened
+from rfm_commands.serve_screen import ServeScreen, doors, log_file, opened
 from rfm_commands.try_video import try_video
 
 ACCEPTED_WARNING = "a Triton with known remote vulnerabilities is accepted: use NVIDIA's container 26.07 or newer"
@@ -120,9 +120,10 @@ def export(
         return
     if settings.checkpoint is None:
         fail("CHECKPOINT: expected a checkpoint, here or as export.checkpoint in --config, got none")
-    version = rfm_export.export(
-        settings.checkpoint, repository, settings, other_machine=other_machine, device=device, say=say
-    )
+    with timed_steps() as begin:
+        version = rfm_export.export(
+            settings.checkpoint, repository, settings, other_machine=other_machine, device=device, say=say, begin=begin
+        )
     whose = "the checkpoint's" if settings.weights is None else f"those of the checkpoint in {settings.weights}"
     typer.echo(f"{repository}: {settings.name} version {version}, scores equal to {whose}")
 
@@ -174,6 +175,8 @@ def serve(
     """
     raise_limit()  # Triton and the gateway inherit it
     folder, more_arguments = _folder_and_arguments(words or (), repository)
+    if not has_gpu():
+        more_arguments = [*without_gpus(more_arguments), *more_arguments]
     config = _config(config_file, serve=given, gateway=gateway_given)
     if gateway_given and config.gateway.port is None:
         option = GatewayBeside.settings()[next(iter(gateway_given))].option
@@ -196,7 +199,8 @@ def serve(
             hang_s=config.serve.hang_s,
         )
         beside = None if config.gateway.port is None else _beside(server, config, gateway_given)
-        screen = ServeScreen(folder, endpoints, beside, log) if log is not None and sys.stderr.isatty() else None
+        found = doors(endpoints, more_arguments, config.serve.status_port, beside, os.environ)
+        screen = ServeScreen(folder, endpoints, found, log) if log is not None and sys.stderr.isatty() else None
         supervisor = Supervisor(
             server,
             gateway=None if beside is None else _gateway_process(beside, config),
@@ -207,6 +211,12 @@ def serve(
         )
         if screen is not None:
             screen.show_start()
+        else:
+            kinds = dict.fromkeys(asks for _, asks in found.values())
+            ports = {kind: ", ".join(name for name, (_, asks) in found.items() if asks == kind) for kind in kinds}
+            if not has_gpu():
+                logger.info("no GPU: Triton's lines about CUDA, streams and pinned memory are no faults")
+            logger.info("%s", "; ".join(f"asks callers for {kind}: {names}" for kind, names in ports.items()))
         _run(supervisor, log)
 
 
@@ -282,4 +292,5 @@ def _config(file: Path | None, **options: OptionValues[Any]) -> Config:
 def main() -> None:
     """Entry point of the ``rfm`` console script."""
     os.environ.update(short_spin(os.environ))  # before PyTorch is imported
+    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # as rfm-client does
     app()

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, ClassVar, NoReturn
 
@@ -34,6 +36,24 @@ class RfmCommands(command.Commands):
     program, other_program = "rfm", "rfm-client"
     elsewhere = ("score", "compare", "status", "wait", "sample", "evaluate")
     missing: ClassVar[dict[str, str]] = {"label": "pip install ./client ./apps/labels ."}
+
+
+@contextmanager
+def timed_steps() -> Iterator[Callable[[str], None]]:
+    """Yield a function that begins a step. A terminal shows each step with its time; standard error else nothing."""
+    from rich.console import Console
+    from rich.progress import Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = TextColumn(f"{RfmCommand.program}: {{task.description}}"), TimeElapsedColumn()
+    with Progress(*columns, console=console, disable=not console.is_terminal) as steps:
+
+        def begin(step: str) -> None:
+            for task in steps.task_ids:
+                steps.stop_task(task)
+            steps.add_task(step, total=None)
+
+        yield begin
 
 
 def say(line: str) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
@@ -17,10 +17,10 @@ from typing import IO
 
 from google.protobuf.text_format import ParseError
 
-from rfm.serve.access import Endpoints
+from rfm.serve.access import KEY, NO_KEY, Endpoints
 from rfm.serve.repository import models_in
 from rfm_client.cli.show import PAGE_PORT, PAGE_URL, command, next_steps, score_step
-from rfm_client.contract.addresses import from_here
+from rfm_client.contract.addresses import from_here, in_url
 from rfm_client.contract.wire import frames_name
 from rfm_commands.rollout import names_of
 from rfm_export.publish import read_config
@@ -51,17 +51,39 @@ def opened(log: Path | None) -> Iterator[IO[bytes] | None]:
         yield file
 
 
+def doors(
+    endpoints: Endpoints,
+    more_arguments: Sequence[str],
+    status_port: int | None,
+    gateway: GatewayConfig | None,
+    environment: Mapping[str, str],
+) -> dict[str, tuple[str, str]]:
+    """Return the URL of each port, and what it asks callers for, by the port's name.
+
+    more_arguments: further tritonserver arguments
+    gateway: the gateway beside the server; None: no gateway
+    """
+    found = endpoints.doors(more_arguments)
+    if status_port is not None:
+        found["status"] = f"http://{in_url(endpoints.host)}:{status_port}/ready", NO_KEY
+    if gateway is not None:
+        url = gateway.address.url("http" if gateway.certificate is None else "https")
+        name = "page" if gateway.viewer and find_spec("rfm_page") is not None else "gateway"
+        found[name] = f"{url}/", NO_KEY if gateway.api_key(environment) is None else KEY
+    return found
+
+
 @dataclass
 class ServeScreen:
     """The screen for one server.
 
-    gateway: the gateway beside it; None: no gateway
+    doors: as ``doors`` returns them
     log: file with Triton's lines
     """
 
     repository: Path
     endpoints: Endpoints
-    gateway: GatewayConfig | None
+    doors: Mapping[str, tuple[str, str]]
     log: Path
     _began_s: float = field(default_factory=time.monotonic)
 
@@ -74,10 +96,7 @@ class ServeScreen:
         """Show the addresses, models and device, and what to try next."""
         rows = {
             "models": f"{self._models()}, on {self._devices()}",
-            "gRPC": self.endpoints.grpc_url,
-            "HTTP": self.endpoints.http_url,
-            "metrics": self.endpoints.metrics_url,
-            **self._gateway_row(),
+            **{name: f"{url} (asks for {asks})" for name, (url, asks) in self.doors.items()},
             "log": f"{self.log} (lines of Triton and the models)",
         }
         lines = [f"  {name:9}{value}" for name, value in rows.items()]
@@ -108,21 +127,16 @@ class ServeScreen:
                 continue
         return f"GPU {', '.join(map(str, sorted(gpus)))}" if gpus else "the CPU"
 
-    def _gateway_row(self) -> dict[str, str]:
-        if self.gateway is None:
-            return {}
-        url = self.gateway.address.url("http" if self.gateway.certificate is None else "https")
-        has_page = self.gateway.viewer and find_spec("rfm_page") is not None
-        return {"page" if has_page else "gateway": f"{url}/"}
-
     def _steps(self) -> list[tuple[str, str]]:
-        here = replace(self.endpoints, host=from_here(self.endpoints.host))
+        here, tls = replace(self.endpoints, host=from_here(self.endpoints.host)), self.endpoints.grpc_tls
+        shown = [] if tls is None else ["--ca-file", "AUTHORITY.pem"]
+        if tls is not None and tls.client_ca is not None:
+            shown += ["--client-certificate", "CERTIFICATE.pem", "--client-key", "KEY.pem"]
         models = models_in(self.repository)
-        purpose, score = score_step(
-            here.grpc_url, [name for name in names_of(self.repository) if frames_name(name) in models]
-        )
+        scorers = [name for name in names_of(self.repository) if frames_name(name) in models]
+        purpose, score = score_step(here.grpc_url, scorers, *shown)
         steps = [(f"in another terminal, {purpose}", score)]
-        if self.gateway is None:
+        if not {"page", "gateway"} & self.doors.keys():
             again = command("rfm", "serve", self.repository, "--gateway-port", PAGE_PORT)
             steps.append((f"or serve it with the page at {PAGE_URL}", again))
         return steps

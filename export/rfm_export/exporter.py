@@ -48,6 +48,7 @@ def export(
     family: str | None = None,
     device: str | None = None,
     say: Printer = _nobody,
+    begin: Printer = _nobody,
 ) -> int:
     """Write the checkpoint at ``source`` into ``repository``, and return its version number.
 
@@ -58,17 +59,21 @@ def export(
     device: where scores are compared; None: the CPU, for a large network a GPU with enough free memory
     say: receives lines for the user: the run's config.yaml, ``rfm.published.notes``, a derived ``max_batch_size``, the
         device for a large network
+    begin: receives each step that may take minutes, as it begins
 
     Raises CheckpointError, ExportError.
     """
+    begin("reading the checkpoint")
     read = read_for_export(source, settings, family, device, say, other_machine=other_machine)
     names = [settings.name, encoder_name(settings.name), frames_name(settings.name)]
     with alone(repository), staging(repository, names) as staged:
         version = Version(next_version(repository, names), read.settings, read.num_gpus, read.family.name)
         models = generated_models(read.description, read.of_encoders, version)
         _check_replaceable(repository, models, settings)
+        begin(f"writing version {version.number}")
         with _needing_disk(repository):
             _save(read, version, staged)
+        begin("comparing the export's scores with the checkpoint's")
         if (difference := compare(read, version, staged, say)) is not None:
             description = replace(read.description, weights_difference=difference)
             models = generated_models(description, read.of_encoders, version)

@@ -9,7 +9,7 @@ import secrets
 import socket
 import stat
 from collections import deque
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from itertools import count, islice
 from pathlib import Path
@@ -26,6 +26,9 @@ HEADER = "rfm-admin-key"
 MIN_CHARACTERS = 16
 _GRPC_PREFIX = "triton-grpc-protocol-"  # Triton puts it before the header name
 _RESTRICTED = "model-repository,logging,trace"
+_RESTRICTIONS = {"HTTP": "http-restricted-api", "gRPC": "grpc-restricted-protocol"}  # tritonserver's options
+_SCORING = "inference"  # the restricted API
+NO_KEY, KEY, CERTIFICATE = "no key", "a key", "a client certificate"  # what a port asks its callers for
 _RANDOM_BYTES = 32
 _VISIBLE = re.compile("[!-~]*")  # characters that a header can carry unchanged
 
@@ -48,9 +51,7 @@ def take_key(file: Path | None, environment: MutableMapping[str, str]) -> str | 
 
 def restrictions(key: str) -> list[str]:
     """Return tritonserver arguments that refuse administrative requests without ``key``."""
-    return [
-        f"--{option}={_RESTRICTED}:{HEADER}={key}" for option in ("http-restricted-api", "grpc-restricted-protocol")
-    ]
+    return [f"--{option}={_RESTRICTED}:{HEADER}={key}" for option in _RESTRICTIONS.values()]
 
 
 def http_headers(key: str | None) -> Mapping[str, str]:
@@ -172,6 +173,21 @@ class Endpoints:
     def metrics_url(self) -> str:
         """URL where Prometheus reads Triton's metrics."""
         return f"http://{in_url(self.host)}:{self.metrics_port}/metrics"
+
+    def doors(self, more_arguments: Sequence[str] = ()) -> dict[str, tuple[str, str]]:
+        """Return the URL of each port, and what it asks callers for, by the port's name.
+
+        more_arguments: further tritonserver arguments, which may restrict scoring
+        """
+        asks = dict.fromkeys(("gRPC", "HTTP", "metrics"), NO_KEY)
+        if self.grpc_tls is not None and self.grpc_tls.client_ca is not None:
+            asks["gRPC"] = CERTIFICATE
+        for name, option in _RESTRICTIONS.items():
+            given = (each.partition("=")[2] for each in more_arguments if each.startswith(f"--{option}="))
+            if any(_SCORING in each.partition(":")[0].split(",") for each in given):
+                asks[name] = KEY
+        urls = {"gRPC": self.grpc_url, "HTTP": self.http_url, "metrics": self.metrics_url}
+        return {name: (url, asks[name]) for name, url in urls.items()}
 
     def arguments(self) -> list[str]:
         """Return tritonserver arguments for these addresses."""

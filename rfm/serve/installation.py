@@ -13,6 +13,7 @@ import os
 import shutil
 import sys
 import sysconfig
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,6 +24,8 @@ WHEEL = "nvidia-pytriton"
 WHEEL_VERSION = "2.51.0"  # the Triton version that it contains
 _BACKEND_FILES = ("libtriton_python.so", "triton_python_backend_utils.py")
 _STUB = "triton_python_backend_stub"
+_GPU_DEVICES = "/dev/nvidiactl", "/dev/dxg"  # on Linux; on WSL 2
+_OF_GPUS = {"--allow-gpu-metrics": "false", "--pinned-memory-pool-byte-size": "0"}
 
 
 class ServerStartError(LocatedError):
@@ -65,6 +68,17 @@ def find_installation(executable: Path | None = None) -> Installation:
         return Installation(executable)
     in_path = shutil.which(EXECUTABLE)
     return Installation(Path(in_path)) if in_path else _wheel_installation()
+
+
+def has_gpu() -> bool:
+    """True if this machine has a GPU that CUDA can use."""
+    return any(map(os.path.exists, _GPU_DEVICES))
+
+
+def without_gpus(given: Sequence[str]) -> list[str]:
+    """Return the tritonserver arguments that turn off what fails without a GPU, except those in ``given``."""
+    names = {argument.partition("=")[0] for argument in given}
+    return [f"{name}={value}" for name, value in _OF_GPUS.items() if name not in names]
 
 
 def _wheel_installation() -> Installation:

@@ -21,7 +21,7 @@ import tritonclient.http
 from typer.main import get_command
 
 import clip
-from client_commands import MODEL, RFM_CLIENT, WIDTHS, ask, columns, invoke, rows
+from client_commands import MODEL, RFM_CLIENT, WIDTHS, ask, columns, invoke, rows, run
 from engine_server import EngineServer
 from gateways import running
 from in_process import rfm_client_app
@@ -118,8 +118,8 @@ def test_status_without_metrics_shows_the_rest_and_says_so(served: Served) -> No
     address = free_url()
     result = invoke("status", "--url", served.url("http"), "--metrics-url", f"{address}/metrics")
     assert result.exit_code == 0
-    assert f"no metrics of the machine: {address}/metrics: " in result.stdout
-    assert "give their URL (--metrics-url)" in result.stdout
+    told = f"no metrics of the machine: {address}/metrics: Connection refused: give their URL (--metrics-url)\n"
+    assert told in result.stdout
     requests, batches = rows(result.stdout, f"{MODEL} ")
     assert batches[6] == "load"
     assert (requests[1:3], requests[5:]) == (["1", "READY"], ["-", "-"])
@@ -262,6 +262,8 @@ def test_the_error_for_tls_to_a_server_without_it_names_the_plain_scheme(demo_se
     for url, remedy in ((demo_server.grpc_url, "use grpc://"), (demo_server.http_url, "without: grpc:// or http://")):
         with RewardClient(url.replace("://", "s://"), retry=False) as client, pytest.raises(ServerError, match=remedy):
             client.model_info()
+    told = run("sample", "--url", demo_server.grpc_url.replace("://", "s://")).stderr
+    assert re.fullmatch(r"rfm-client: .*use grpc://.*\n", told), told  # without gRPC's own lines
 
 
 def test_a_gateway_and_a_folder_are_no_triton(demo_server: Endpoints, tmp_path: Path) -> None:

@@ -23,12 +23,14 @@ from rfm_client import (
     RewardError,
     ServerUnavailableError,
 )
+from servers import wait_for
 from trajectories import random_trajectory
 from transports import Answer, Tensors
 
 NUM_FRAMES = 4
 SEEN = random_trajectory(0, NUM_FRAMES)
 WITHIN_S = 30.0
+LACKING = ModelNotFoundError("lacking")
 
 
 class Stand:
@@ -110,10 +112,22 @@ def test_cached_model_info_is_dropped_when_another_version_answers() -> None:
         client.progress(SEEN)
         assert client.model_info().versions == ("1",)
         assert stand.asked["model_info"] == 3
-        stand.error = ModelNotFoundError("rfm is not served")
-        for refresh in (True, False):
-            with pytest.raises(ModelNotFoundError):
-                client.model_info(refresh=refresh)
+
+
+def test_a_model_that_answered_before_and_is_missing_is_waited_for() -> None:
+    stand = Stand(error=LACKING)
+    with RewardClient("", transports=[stand]) as client:
+        with pytest.raises(ModelNotFoundError):
+            client.progress(SEEN)
+        stand.error = None
+        client.progress(SEEN)
+        stand.error = LACKING
+        with pytest.raises(ServerUnavailableError, match=r"^lacking: it answered before, .*: try again"):
+            client.progress(SEEN, timeout_s=0.3)
+        waiting = client.submit(ProgressSample(SEEN))
+        wait_for(lambda: stand.asked["infer"] > 6)
+        stand.error = None
+        waiting.result()
 
 
 def ask(stands: list[Stand], calls: int = 1, *, timeout_s: float = 4.0) -> list[object]:
@@ -151,9 +165,6 @@ def test_pauses_double_and_half_of_each_is_random(monkeypatch: pytest.MonkeyPatc
 
 def kinds(outcomes: list[object]) -> set[type]:
     return {type(outcome) for outcome in outcomes}
-
-
-LACKING = ModelNotFoundError("lacking")
 
 
 def test_a_server_that_lacks_the_model_is_left_out() -> None:

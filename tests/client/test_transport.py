@@ -250,6 +250,15 @@ def test_requests_are_spread_over_the_addresses_of_a_name() -> None:
                 assert time.monotonic() < end_s
 
 
+def test_a_call_that_ends_long_after_its_deadline_says_that_its_process_stood_still() -> None:
+    """Such as one that SIGSTOP stopped. The test moves the deadline into the past instead."""
+    deadline = Deadline(60)
+    assert str(deadline.exceeded("grpc://a:1")) == "grpc://a:1: no answer within 60 s"
+    deadline.at_s -= 312
+    told = "grpc://a:1: no answer within 60 s; 312 s have passed, since this process itself stood still"
+    assert str(deadline.exceeded("grpc://a:1")) == told
+
+
 def test_bytes_in_flight_are_bounded_and_more_than_the_bound_goes_alone() -> None:
     async def ask() -> None:
         room = ConcurrencyLimiter(10).room

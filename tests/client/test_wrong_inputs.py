@@ -121,6 +121,10 @@ FAILURES = {
         1,
         f"--grpc-certificate: {PAIR} key.pem and key.pem, got a file in another format",
     ),
+    "rfm serve repository --host 10.0.0.5 --grpc-certificate key.pem --grpc-key key.pem": (
+        *(1, "--grpc-certificate: expected client certificates (--grpc-client-ca) at 10.0.0.5, "),
+        "since TLS alone asks callers for nothing, got none; --grpc-any-client serves everyone",
+    ),
     "rfm serve repository --gateway-port FREE_PORT --gateway-dataset nope": (1, f"--gateway-dataset: {SHOWN} nope"),
     "rfm serve repository --config mistake.yaml": (
         *(1, "mistake.yaml: expected a YAML file, got a mistake in line 2 "),

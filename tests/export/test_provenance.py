@@ -116,8 +116,9 @@ def test_a_mask_that_no_file_states_is_assumed_aloud() -> None:
 
 
 def test_an_export_keeps_assumptions_and_versions_and_nothing_reads_them(tmp_path: Path) -> None:
-    settings, said = replace(serve_config(FRAMES), dtype="float32"), list[str]()
-    rfm_export.export(FRAMES.checkpoint, tmp_path, settings, say=said.append)
+    settings, said, begun = replace(serve_config(FRAMES), dtype="float32"), list[str](), list[str]()
+    rfm_export.export(FRAMES.checkpoint, tmp_path, settings, say=said.append, begin=begun.append)
+    assert [step.partition(" ")[0] for step in begun] == ["reading", "writing", "comparing"]
     checkpoint = tmp_path / "rfm" / "1" / "checkpoint"
     whose = {name: f"--{name}-encoder; weights of the checkpoint" for name in ("image", "text")}
     assert json.loads((checkpoint / "provenance.json").read_text()) == {

@@ -69,6 +69,30 @@ def test_a_process_that_is_killed_again_and_again_keeps_its_finished_parts(
     assert 0 < goes_on(output, undisturbed) < NUM_FRAMES
 
 
+KILLED = """
+import itertools, os, runpy, signal, sys
+program, left = sys.argv[1], itertools.count(int(sys.argv.pop(2)), -1)
+sys.argv[:] = sys.argv[1:]
+os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL) if next(left) == 0 else None
+sys.path.insert(0, os.path.dirname(program))
+runpy.run_path(program, run_name="__main__")
+"""
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_while_it_writes_leaves_nothing_after_the_next(
+    output: Path, undisturbed: list[bytes]
+) -> None:
+    """Killed before the first of 10 parts is synced, then before each of both label files is."""
+    for count in (0, 10, 1):
+        words = [sys.executable, "-c", KILLED, labelling.__file__, str(count), str(ROOT), str(output), "0"]
+        killed = subprocess.run(words, capture_output=True, text=True, check=False)
+        assert killed.returncode == -signal.SIGKILL, killed.stderr
+        assert list(output.rglob(".*.tmp"))
+    goes_on(output, undisturbed)
+    assert not list(output.rglob(".*.tmp"))
+
+
 def test_two_runs_at_a_time_write_the_same_files(output: Path, undisturbed: list[bytes]) -> None:
     options = LabelOptions(output=output, workers=2, **FEW)
     threads = [
@@ -163,6 +187,15 @@ def test_parts_may_be_behind_a_url(output: Path, undisturbed: list[bytes]) -> No
     assert goes_on(output, undisturbed, parts="memory://labels/parts") == NUM_FRAMES
     assert goes_on(output, undisturbed, parts="memory://labels/parts") == 0
     assert not (output / ".rfm_parts").exists()
+
+
+def test_a_label_file_that_cannot_be_replaced_is_named_with_those_that_are_new(output: Path) -> None:
+    (output / FILES[1]).mkdir(parents=True)
+    with pytest.raises(
+        OSError, match=rf"{FILES[1]}: cannot be replaced: Is a directory; .*{FILES[0]} is new already: make"
+    ):
+        label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output, limit=1, overwrite=True, **FEW))
+    assert (output / FILES[0]).is_file()
 
 
 SPOILT: dict[str, Callable[[Any], Any]] = {

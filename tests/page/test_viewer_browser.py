@@ -8,6 +8,7 @@ import io
 import itertools
 import json
 import re
+import shlex
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -413,9 +414,9 @@ def test_the_figure_fits_a_column_of_a_paper_and_is_light(page: Page) -> None:
 
 
 MODULES = """
-const done = arguments[0];
-Promise.all(["text", "takeaway", "curves", "figure"].map((name) => import(`/viewer/${name}.js`))).then(
-  ([{ cut }, { serverOption }, { Curve }, { svgFigure }]) => {
+const [named, done] = arguments;
+Promise.all(["text", "takeaway", "curves", "figure", "exports"].map((name) => import(`/viewer/${name}.js`))).then(
+  ([{ cut }, { serverOption }, { Curve }, { svgFigure }, { lerobotWords }]) => {
     const settings = { task: "lift", model: "m", rule: "all", fps: 1 };
     const curve = new Curve({ title: "a.mp4", id: 1 }, settings);
     curve.take("video", { num_frames: 7, times_s: null });
@@ -429,16 +430,19 @@ Promise.all(["text", "takeaway", "curves", "figure"].map((name) => import(`/view
       ["grpc://127.0.0.1:8001", "http://localhost:8100/"], ["grpc://localhost:8001", "https://gpu-box.lan:8443/"],
       ["grpc://triton:8001", "https://gpu-box.lan:8443/"],
     ].map((each) => serverOption(...each));
-    done([figure, names, servers]);
+    const words = lerobotWords("delete", { name: named, kind: "LeRobot v3.0" }, [1], [0, 1]);
+    done([figure, names, servers, words]);
   });
 """
 
 
 def test_modules_cut_names_name_a_reachable_triton_and_lead_a_line_over_skipped_frames(page: Page) -> None:
     """Of seven frames the model skips three, and the score of one is missing."""
-    markup, names, servers = page.browser.driver.execute_async_script(MODULES)
+    dataset = "Ann's set; touch \n$(touch x)"
+    markup, names, servers, words = page.browser.driver.execute_async_script(MODULES, dataset)
     assert names == ["rollout_seed…100k.mp4", "success.mp4"]
     assert servers == [["--url", "grpc://127.0.0.1:8001"], [], ["--url", "grpc://triton:8001"]]
+    assert shlex.split(words, comments=True)[:4] == ["lerobot-edit-dataset", "--repo_id", dataset, "--root"]
     svg = ElementTree.fromstring(markup)
     assert [len(line.attrib["points"].split()) for line in svg.iter(f"{SVG}polyline")] == [2, 1]
     assert "\N{MINUS SIGN}0.5" in texts(svg)  # the axis reaches the score below 0

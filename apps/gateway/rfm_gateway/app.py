@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import errno
 import logging
-from collections.abc import AsyncIterator, Awaitable, Callable
+import tempfile
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -44,7 +46,7 @@ from rfm_gateway.observe import (
 )
 from rfm_gateway.refusals import LingerMiddleware, asked, refuse
 from rfm_gateway.scoring import WARNING_HEADER, Evaluator
-from rfm_gateway.state import ServedParts, TritonState, message_of
+from rfm_gateway.state import TritonState, message_of
 
 _REFERENCE = "#/components/schemas/{model}"
 _MODELS = (schema.EvaluateBatchRequest, schema.InvalidRequest, schema.Failure)
@@ -55,6 +57,10 @@ _STATUS_OF = {  # HTTP status, by the client's error
     InferenceFailedError: 502,
     AccessDeniedError: 502,  # the gateway's own credentials, not the caller's
 }
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_NO_FOLDER = "No usable temporary directory"  # Python's words if none of the folders can be written at the first use
+_CLOSE = {"Connection": "close"}  # the rest of the body stays unread
 
 logger = logging.getLogger("rfm_gateway")
 
@@ -76,8 +82,7 @@ def create_app(
     """
     client, metrics = client or config.client(), GatewayMetrics()
     limits = BodyLimits(config.max_body_mib * MIB, config.timeout_s)
-    parts = ServedParts()
-    state = TritonState(client, config, parts)
+    state = TritonState(client, config)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -107,7 +112,7 @@ def create_app(
     guards = [] if api_key is None else [Depends(key_check(api_key))]
     guarded = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
     evaluator = Evaluator(
-        client, limits.timeout_s, parts, use_frame_steps=config.use_frame_steps, refuse_blank=config.refuse_blank
+        client, limits.timeout_s, use_frame_steps=config.use_frame_steps, refuse_blank=config.refuse_blank
     )
     place = Depends(Places(config, metrics).taken)
     _add_evaluations(guarded, limits, evaluator, metrics, place)
@@ -205,7 +210,9 @@ def _failures(*codes: int) -> dict[int | str, dict[str, Any]]:
 def _handlers() -> dict[Any, Any]:
     """Return handlers that answer every error as JSON, and never answer bad input with 500."""
 
-    def fixed(code: int, detail: str, **headers: str) -> Callable[..., Awaitable[JSONResponse]]:
+    def fixed(
+        code: int, detail: str, headers: Mapping[str, str] | None = None
+    ) -> Callable[..., Awaitable[JSONResponse]]:
         async def handler(request: Request, _error: Exception) -> JSONResponse:
             return refuse(request.scope, code, detail, headers)
 
@@ -221,17 +228,26 @@ def _handlers() -> dict[Any, Any]:
         code = next((code for kind, code in _STATUS_OF.items() if isinstance(error, kind)), 500)
         return refuse(request.scope, code, message_of(error), RETRY_AFTER if code == 503 else None)
 
+    async def without_room(request: Request, error: OSError) -> JSONResponse:
+        if error.errno not in _NO_ROOM and _NO_FOLDER not in str(error):
+            raise error
+        folder = tempfile.tempdir or "its temporary folders"  # None: not found
+        remedy = "try again, or whoever runs the gateway makes room there or names another folder in TMPDIR"
+        detail = f"body: expected room in {folder} of the gateway, got {error.strerror}: {remedy}"
+        return refuse(request.scope, 503, detail, {**RETRY_AFTER, **_CLOSE})
+
     async def unexpected(request: Request, error: Exception) -> JSONResponse:
         logger.error("500 %s: unexpected", asked(request.scope), exc_info=error)
-        return JSONResponse({"detail": "the gateway failed; its log has the reason"}, 500)
+        return JSONResponse({"detail": "the gateway failed; its log has the reason"}, 500, _CLOSE)
 
     return {
         HTTPException: refused,
         RequestValidationError: invalid,
-        TimeoutError: fixed(408, "body: expected all of it in time, got a part", Connection="close"),
+        TimeoutError: fixed(408, "body: expected all of it in time, got a part", _CLOSE),
         ClientDisconnect: fixed(400, "body: expected all of it, got a part"),  # the caller is gone
         CallerLeftError: fixed(CALLER_LEFT, "the caller has hung up"),  # for the log and the metrics
         RewardError: failed,
+        OSError: without_room,
         Exception: unexpected,
     }
 

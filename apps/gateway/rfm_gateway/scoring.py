@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, replace
 from itertools import chain, islice
 from traceback import clear_frames
@@ -17,6 +18,7 @@ from rfm_client import (
     Float32Array,
     InvalidSampleError,
     ModelInfo,
+    ModelNotFoundError,
     PreferenceResult,
     PreferenceSample,
     ProgressResult,
@@ -37,7 +39,6 @@ from rfm_gateway import schema
 from rfm_gateway.body import Batch
 from rfm_gateway.field_errors import refused
 from rfm_gateway.observe import within
-from rfm_gateway.state import ServedParts
 
 FRAME_STEPS = 4  # the evaluation server samples each prefix to this many frames
 FRAME_STEPS_FOR_SECONDS = 8  # the same, for a model that predicts remaining seconds
@@ -55,14 +56,12 @@ Text: TypeAlias = Float32Array | InvalidSampleError  # a task's embedding, or th
 class Evaluator:
     """Scores batches with the server behind ``client``.
 
-    parts: parts that were served: if one is missing now, that is a server error
     use_frame_steps: for requests that do not say
     refuse_blank: True: black and single-colour frames are invalid
     """
 
     client: AsyncRewardClient
     timeout_s: float
-    parts: ServedParts
     _: KW_ONLY
     use_frame_steps: bool
     refuse_blank: bool
@@ -121,9 +120,10 @@ class Evaluator:
         return embeddings, frames
 
     async def _model_info(self, *, frames: bool) -> ModelInfo | None:
-        with self.parts.asking("frames" if frames else "embeddings"):
+        try:
             return await self.client.model_info(frames=frames)
-        return None
+        except ModelNotFoundError:
+            return None
 
     async def _texts(self, samples: Sequence[schema.Sample], request_id: str) -> Mapping[str, Text]:
         """Return embeddings by task, for tasks without an embedding; empty without an encoder."""
@@ -132,7 +132,7 @@ class Evaluator:
         tasks = {task for task in unread if task and task.strip()}
         texts: dict[str, Text] = {}
         if tasks:
-            with self.parts.asking("encoder"):
+            with suppress(ModelNotFoundError):
                 found = await asyncio.gather(*(self._text(task, request_id) for task in tasks))
                 texts = dict(zip(tasks, found, strict=True))
         return texts

@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 
 from rfm_client import (
     AccessDeniedError,
@@ -47,33 +46,12 @@ def message_of(error: RewardError) -> str:
     return str(for_callers)
 
 
-class ServedParts:
-    """The checkpoint's parts (embeddings, frames, encoder) that were served since the gateway began.
-
-    A part that is missing now is missing only for a while: a restarting server loads one model after another.
-    """
-
-    def __init__(self) -> None:
-        self._seen: set[str] = set()
-
-    @contextmanager
-    def asking(self, part: str) -> Iterator[None]:
-        """Ask about a part. Suppresses ModelNotFoundError for a part that was never served."""
-        try:
-            yield
-            self._seen.add(part)
-        except ModelNotFoundError:
-            if part in self._seen:
-                raise
-
-
 class TritonState:
-    """The state of the client's checkpoint. parts: must be served for ``/health``"""
+    """The state of the client's checkpoint."""
 
-    def __init__(self, client: AsyncRewardClient, config: GatewayConfig, parts: ServedParts) -> None:
+    def __init__(self, client: AsyncRewardClient, config: GatewayConfig) -> None:
         self._client = client
         self._config = config
-        self._parts = parts
         self._refreshing = asyncio.Lock()
         self._refreshed_s = float("-inf")
         self._health: schema.Health | str = ""  # a text: the fault
@@ -128,11 +106,12 @@ class TritonState:
             return None
 
     async def _infos(self) -> list[ModelInfo]:
-        """Return facts about the models for embeddings and for raw frames. Raises ServerError, also if one got lost."""
-        infos = []
-        for part in ("embeddings", "frames"):
-            with self._parts.asking(part):
-                infos.append(await self._client.model_info(frames=part == "frames", refresh=True))
+        """Return facts about the models for embeddings and for raw frames.
+
+        Raises ServerError, also if one of them or the encoder was served before and is missing.
+        """
+        served = await self._client.model_infos()
+        infos = [info for part in ("embeddings", "frames") for info in served.get(part, [])]
         return infos or [await self._client.model_info(frames=True)]
 
     async def _probe_all(self) -> schema.Health | str:

@@ -17,13 +17,14 @@ set per camera. The metadata describes each score column.
 
 from __future__ import annotations
 
+import fcntl
 import io
 import os
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import IO, Any, TypeAlias
 
 import numpy as np
 
@@ -176,19 +177,61 @@ class Parts:
 def whole_files(*targets: Path) -> Iterator[list[Path]]:
     """Yield a temporary file for each target. After the block, sync all files to disk, then replace the targets.
 
-    If the block raises or a write fails, all targets stay unchanged.
+    If the block raises or a write fails, all targets stay unchanged. If a replacement fails, the OSError names the
+    targets that are new already.
     """
-    written = [target.with_name(f".tmp-{uuid.uuid4().hex}") for target in targets]
-    try:
+    with ExitStack() as temporary:
+        written = [temporary.enter_context(_temporary(target)) for target in targets]
         yield written
         for file in written:
             with file.open("rb") as whole:
                 os.fsync(whole.fileno())
-        for file, target in zip(written, targets, strict=True):
-            file.replace(target)
-    finally:
-        for file in written:
-            file.unlink(missing_ok=True)
+        for number, (file, target) in enumerate(zip(written, targets, strict=True)):
+            try:
+                file.replace(target)
+            except OSError as error:
+                new = "".join(f"; {each} is new already" for each in targets[:number])
+                raise OSError(f"{target}: cannot be replaced: {error.strerror}{new}") from error
+
+
+@contextmanager
+def _temporary(target: Path) -> Iterator[Path]:
+    """Yield an empty file beside the target, and remove it after the block, unless it was moved.
+
+    The name is fixed, so that a repeated run overwrites what a killed run left. It is a random one while another run
+    writes the same target, or if the file system has no locks.
+    """
+    file = target.with_name(f".{target.name}.{os.getuid()}.tmp")  # this user can overwrite it
+    with ExitStack() as files:
+        opened = files.enter_context(file.open("ab"))
+        if not _locked(file, opened):
+            file = target.with_name(f".{target.name}.{uuid.uuid4().hex}.tmp")
+            opened = files.enter_context(file.open("xb"))
+        try:
+            yield file
+        finally:
+            if _is_at(file, opened):  # else it was moved, and the name may be another run's by now
+                file.unlink()
+
+
+def _locked(file: Path, opened: IO[bytes]) -> bool:
+    """Lock the open file until it is closed, even by a kill. Return False if another run has it or has moved it."""
+    try:
+        fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # the file system has no locks, so nobody uses the name
+        file.unlink(missing_ok=True)
+        return False
+    return _is_at(file, opened)
+
+
+def _is_at(file: Path, opened: IO[bytes]) -> bool:
+    """True if the open file has this path."""
+    try:
+        return os.path.samestat(file.stat(), os.fstat(opened.fileno()))
+    except FileNotFoundError:
+        return False
 
 
 def _progress_form(plan: Plan, columns: Sequence[str]) -> Form:

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 
 def main() -> None:
     """Entry point of the ``rfm-client`` console script."""
+    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # gRPC's own lines say less than the error, and hide it
     try:
         from rfm_client.cli.commands import app
     except ModuleNotFoundError as error:

@@ -184,10 +184,10 @@ def next_steps(*steps: tuple[str, str]) -> str:
     return "\n".join(["Next:", *(f"  # {purpose}\n  {line}" for purpose, line in steps)])
 
 
-def score_step(url: str, models: Sequence[str]) -> tuple[str, str]:
-    """Return how to score something with a running server. models: those that score frames."""
+def score_step(url: str, models: Sequence[str], *more: str) -> tuple[str, str]:
+    """Return how to score something with a running server. models: those that score frames; more: further options"""
     options = [] if url in DEFAULT_URLS else ["--url", url]
     if not models:
-        return "score random embeddings", command("rfm-client", "sample", *options)
+        return "score random embeddings", command("rfm-client", "sample", *options, *more)
     options += [] if DEFAULT_MODEL in models else ["--model", models[0]]
-    return "score a video", command("rfm-client", "score", "VIDEO", "--task", "TASK", *options)
+    return "score a video", command("rfm-client", "score", "VIDEO", "--task", "TASK", *options, *more)

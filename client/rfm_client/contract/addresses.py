@@ -153,16 +153,18 @@ def with_proxy(url: str) -> str:
 
 
 def open_url(url: str, timeout_s: float) -> Any:
-    """Open the URL and return the response. Raises OSError or HTTPException."""
+    """Open the URL and return the response. Raises OSError or HTTPException, without the words of urllib."""
     scheme, host = urlsplit(url).scheme, urlsplit(url).hostname or ""
     proxies = urllib.request.ProxyHandler({} if is_loopback(host) else None)
     try:  # a new opener, because urlopen keeps the proxies from its first call
         return urllib.request.build_opener(proxies).open(url, timeout=timeout_s)
     except OSError as error:
+        reason = getattr(error, "reason", error)  # of a URLError; of its kind HTTPError a text
+        text = " ".join(map(str, (getattr(error, "code", ""), getattr(reason, "strerror", None) or reason))).strip()
         proxy = urllib.request.getproxies().get(scheme)
-        if not proxy or is_loopback(host) or urllib.request.proxy_bypass(host):
-            raise
-        raise OSError(f"{error} (through {_shown(f'{scheme}_proxy', proxy)})") from error
+        if proxy and not (is_loopback(host) or urllib.request.proxy_bypass(host)):
+            text += f" (through {_shown(f'{scheme}_proxy', proxy)})"
+        raise OSError(text) from error
 
 
 def _covers(entry: str, host: str) -> bool:

@@ -111,7 +111,7 @@ class ServerError(RewardError):
 
 
 class ServerUnavailableError(ServerError):
-    """The server is unreachable, not ready, or refuses more requests for now."""
+    """The server is unreachable, not ready, lacks a model that answered before, or refuses more requests for now."""
 
 
 class ProcessEndedError(ServerUnavailableError):
@@ -125,7 +125,7 @@ class DeadlineExceededError(ServerError, TimeoutError):
 
 
 class ModelNotFoundError(ServerError):
-    """The server does not serve this model."""
+    """The server does not serve this model, and has not served it to this client before."""
 
 
 class AccessDeniedError(ServerError):

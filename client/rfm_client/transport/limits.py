@@ -22,6 +22,7 @@ MAX_REQUEST_BYTES = 2**31 - 2**16  # gRPC and Triton's HTTP server count message
 _BYTES_PER_GB = 1e9
 _LENGTH_BYTES = 4  # before every text
 MAX_BYTES = 256 * 2**20  # input bytes; writing to a socket holds several copies
+LATE_S = 2.0  # if a call ends so long after its deadline, this process was stopped or did not get to it
 MAX_TIMEOUT_S = 1e9  # more than 30 years; Triton counts nanoseconds, and not many more
 
 
@@ -57,7 +58,10 @@ class Deadline:
 
     def exceeded(self, where: str = "") -> DeadlineExceededError:
         """Return the error for a call that ran out of time at the server ``where``."""
-        return DeadlineExceededError(f"{where}{': ' if where else ''}no answer within {self.timeout_s:g} s")
+        passed_s = self.passed_s
+        late = f"; {passed_s:.0f} s have passed, since this process itself stood still"
+        text = f"no answer within {self.timeout_s:g} s{late * (passed_s > self.timeout_s + LATE_S)}"
+        return DeadlineExceededError(f"{where}: {text}" if where else text)
 
 
 def check_size(inputs: Tensors, shared: Collection[str]) -> None:

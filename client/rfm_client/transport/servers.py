@@ -8,7 +8,8 @@ request may be sent twice:
 - the server is down, restarting or full: retry at once on another server, else after growing pauses
 - a process or the connection ended, perhaps because of this request: retry once, when a server can be back. So a
   request ends at most two processes
-- the server denies access, fails, or lacks the model: try each other server once
+- a model that answered before is missing: the server restarts or loads another version, so it counts as down
+- the server denies access, fails, or lacks a model that never answered: try each other server once
 - the sample is at fault, or the time is up: do not retry
 """
 
@@ -108,6 +109,7 @@ class Servers:
         self._servers = [KnownServer(transport) for transport in transports]
         self._retry = retry
         self._is_closed = False
+        self._answered: set[str] = set()  # models that any server has served
         self._moments = itertools.count(1)
 
     def __len__(self) -> int:
@@ -207,7 +209,7 @@ class Servers:
             server = self._best(refusals, first)
             left_s = deadline.remaining_s()
             try:
-                answer = await server.answer(request, next(self._moments), left_s)
+                answer = await self._ask(server, model, request, left_s)
             except DeadlineExceededError as error:  # the server may hang
                 self._leave_out(server, model, error)
                 failed = failures.get(server)
@@ -248,6 +250,18 @@ class Servers:
                     self._leave_out(other, model, refusal)
                 return answer
         raise min(refusals.values(), key=lambda error: isinstance(error, ModelNotFoundError))  # which says least
+
+    async def _ask(self, server: KnownServer, model: str, request: Request[Answered], left_s: float) -> Answered:
+        """Return the server's answer. A model that answered before and is missing raises ServerUnavailableError."""
+        try:
+            answer = await server.answer(request, next(self._moments), left_s)
+        except ModelNotFoundError as error:
+            if model not in self._answered:
+                raise
+            why = "it answered before, so the server restarts or loads another version: try again"
+            raise ServerUnavailableError(f"{error.fault or error.message}: {why}") from error
+        self._answered.add(model)
+        return answer
 
     def _best(self, avoided: Collection[KnownServer], first: int | None) -> KnownServer:
         """Return the server to ask next: ``first`` or the next one that works; without ``first``, the least busy."""

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: MIT
 // Episodes of a dataset as other programs take them.
 
+import { commented, quoted } from "./shell.js";
+
 /** One number a line. */
 export function episodesText(numbers) {
   return numbers.map((number) => `${number}\n`).join("");
@@ -32,15 +34,15 @@ function edited({ name, kind }, away, all, ending) {
   if (!away.length) return "# these are all episodes: nothing is to be deleted";
   if (away.length === all.length) return "# no episode would be left";
   const early = kind.includes("v3") ? [] : [`# lerobot-edit-dataset reads v3.0, and this is ${kind}: convert it before`];
-  const target = `${name}_${ending}`;
+  const [source, target] = [quoted(name), quoted(`${name}_${ending}`)];
   const operation = `--operation.type delete_episodes --operation.episode_indices "${list(away)}"`;
   return [
     ...early,
     "# LeRobot 0.5 or newer, in the folder that holds the dataset:",
-    `lerobot-edit-dataset --repo_id ${name} --root ${name} --new_repo_id ${target} --new_root ${target} ${operation}`,
+    `lerobot-edit-dataset --repo_id ${source} --root ${source} --new_repo_id ${target} --new_root ${target} ${operation}`,
     "# LeRobot 0.4, which has no --new_root:",
-    `# HF_LEROBOT_HOME=. lerobot-edit-dataset --repo_id ${name} --new_repo_id ${target} ${operation}`,
-    `# LeRobot renumbers the episodes and leaves the labels behind: label ${target} again`,
+    commented(`HF_LEROBOT_HOME=. lerobot-edit-dataset --repo_id ${source} --new_repo_id ${target} ${operation}`),
+    commented(`LeRobot renumbers the episodes and leaves the labels behind: label ${target} again`),
   ].join("\n");
 }
 

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: MIT
 // What can be taken along: CSV, JSON, files, and the command lines that give the same numbers.
 
+import { commented, quoted } from "./shell.js";
 import { leadingOf } from "./signals.js";
 
 const LOOPBACK = /^\w+:\/\/(localhost|127\.[\d.]+|\[::1\])([:/]|$)/;
@@ -98,7 +99,7 @@ function sampling(rule, frames) {
 function labelLine(group, url) {
   const [{ video: { origin }, task, model, rule, sampledFrames, fps, resize }] = group;
   const about = `episode ${origin.episode} of ${origin.dataset}`;
-  if (fps !== origin.fps) return `# ${about}: a command scores all of its frames, ${origin.fps} a second, not ${fps}`;
+  if (fps !== origin.fps) return commented(`${about}: a command scores all of its frames, ${origin.fps} a second, not ${fps}`);
   const cameras = group.map(({ video }) => video.origin.camera);
   const corrections = group.flatMap(({ video, orient, channels }) => corrected({ orient, channels }, `${video.origin.camera}=`));
   const options = ["--episodes", origin.episode, "--cameras", cameras.join(","), ...corrections, ...sampling(rule, sampledFrames)];
@@ -110,7 +111,7 @@ function labelLine(group, url) {
 
 function line(command, videos, { task, model, fps, orient, channels, resize }, url, options) {
   const cut = videos.find(({ origin }) => origin?.dataset);
-  if (cut) return `# ${command}: no file holds episode ${cut.origin.episode} of ${cut.origin.dataset} alone`;
+  if (cut) return commented(`${command}: no file holds episode ${cut.origin.episode} of ${cut.origin.dataset} alone`);
   const files = videos.map(({ name, origin }) => origin?.url ?? (name.startsWith("-") ? `./${name}` : name));
   const words = ["rfm-client", command, ...files, ...serverOption(url), "--model", model, "--task", task, "--fps", fps];
   return [...words, ...corrected({ orient, channels }), ...(resize ? ["--resize"] : []), ...options].map(quoted).join(" ");
@@ -125,12 +126,6 @@ function corrected({ orient, channels }, camera = "") {
 /** The option that says where Triton is. On a loopback address only a page of the same machine reaches it. */
 export function serverOption(url, pageUrl = location.href) {
   return LOOPBACK.test(url) && !LOOPBACK.test(pageUrl) ? [] : ["--url", url];
-}
-
-/** A word as a shell reads it. */
-function quoted(word) {
-  const text = `${word}`;
-  return /^[\w./:@%+=,-]+$/.test(text) ? text : `'${text.replaceAll("'", `'"'"'`)}'`;
 }
 
 /** Lets the browser save a file. */
