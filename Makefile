@@ -121,8 +121,8 @@ perf: $(INSTALLED)
 	$(BIN)/python benchmarks/perf_analyzer.py --size small --poisson 0.2
 	$(BIN)/python benchmarks/perf_analyzer.py --size default
 
-# Cause faults while callers ask, ten minutes.
-# Processes killed, stopped and hung, a crash loop, rollouts, malformed requests.
+# Cause faults while callers ask, twelve minutes.
+# Processes killed, stopped and hung, a crash loop, rollouts, a greedy caller, malformed requests.
 chaos: $(INSTALLED)
 	$(TOOL) tools/chaos.py
 

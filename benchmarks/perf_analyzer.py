@@ -2,6 +2,7 @@
 """Benchmark with Triton's perf_analyzer: several concurrencies and Poisson rates, all sample types, mixed lengths.
 
     python benchmarks/perf_analyzer.py --size small
+    python benchmarks/perf_analyzer.py --fetch build/perf    # build/perf/perf_analyzer, for a server of your own
 
 The default program comes from the tritonclient 2.51.0 wheel. Each round measures the bare engine in this process, and
 for each load first perf_analyzer, then our own generator (load.py). Figures are compared only within a round.
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import csv
-import os
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -31,6 +32,10 @@ from rfm.serve.triton_server import temporary_server
 
 WHEEL = "tritonclient==2.51.0"
 LIBRARIES = ("libcudart.so.12", "libb64.so.0d")  # nvidia-pytriton's wheel has them under other names
+SCRIPT = """#!/bin/sh
+lib=$(dirname "$(realpath "$0")")/lib
+LD_LIBRARY_PATH=$lib exec "$lib/perf_analyzer" "$@"
+"""
 # Three one-second windows. 999 % accepts windows that disagree.
 OPTIONS = ("-i", "grpc", "--async", "-p", "1000", "--max-trials", "3", "--stability-percentage", "999")
 KINDS = {
@@ -48,11 +53,15 @@ def main() -> None:
     parser.add_argument("--poisson", type=float, nargs="*", default=[0.3], help="rates, as shares of the bare engine's")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--output", type=Path, default=report.OUTPUT)
+    parser.add_argument("--fetch", type=Path, metavar="FOLDER", help="only get the program, and measure nothing")
     arguments = parser.parse_args()
+    if arguments.fetch is not None:
+        print(fetch(arguments.fetch))
+        return
     rows = []
     with TemporaryDirectory(prefix="rfm-perf-") as name:
         folder = Path(name)
-        program, environment = _program(arguments.perf_analyzer, folder)
+        program = arguments.perf_analyzer or fetch(folder / "perf")
         measured = checkpoint(arguments.size, folder)
         bare = BareEngine(measured)
         with (
@@ -66,7 +75,7 @@ def main() -> None:
                 for number in range(arguments.rounds):
                     best = max(bare.measure(load, size)["samples_per_s"] for size in (8, 32))
                     for asked, options in _loads(load, best, arguments.concurrency, arguments.poisson):
-                        told = _run([*command, *options], environment)
+                        told = _run([*command, *options])
                         ours = callers.measure(asked)["samples_per_s"]
                         name = f"{asked.callers} at a time" if asked.callers else "Poisson"
                         rows.append({"requests": kind, "way": name, "round": number, **_figures(told, best, ours)})
@@ -85,12 +94,12 @@ def _loads(
         yield replace(load, callers=0, rate_per_s=share * best), options
 
 
-def _run(command: Sequence[str], environment: Mapping[str, str]) -> Mapping[str, str]:
+def _run(command: Sequence[str]) -> Mapping[str, str]:
     """Run perf_analyzer, and return its CSV row. Raises RuntimeError if it fails."""
     with TemporaryDirectory(prefix="rfm-perf-run-") as folder:
         file = Path(folder) / "run.csv"
         words = [*command, "-f", str(file)]
-        done = subprocess.run(words, env={**os.environ, **environment}, capture_output=True, text=True, check=False)
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
         if done.returncode:
             raise RuntimeError(f"perf_analyzer: expected to measure, got {done.stdout[-1000:]}{done.stderr[-1000:]}")
         return next(csv.DictReader(file.read_text().splitlines()[:2]))
@@ -105,26 +114,29 @@ def _figures(told: Mapping[str, str], best: float, ours: float) -> dict[str, flo
     return {**rates, **times_ms, "compute_ms": compute_us / 1e3}
 
 
-def _program(given: Path | None, folder: Path) -> tuple[Path, dict[str, str]]:
-    """Return the path to perf_analyzer, and the environment variables that it needs."""
-    if given is not None:
-        return given, {}
+def fetch(folder: Path) -> Path:
+    """Write perf_analyzer with the libraries that it needs into a folder. Return the path of a script that runs it."""
+    libraries = folder.absolute() / "lib"
+    libraries.mkdir(parents=True, exist_ok=True)
     pip = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
-    where = ["-d", str(folder), "--only-binary=:all:", "--platform", "manylinux1_x86_64", WHEEL]
+    where = ["-d", str(libraries), "--only-binary=:all:", "--platform", "manylinux1_x86_64", WHEEL]
     subprocess.run([*pip, *where], check=True)
-    (wheel,) = folder.glob("tritonclient-*.whl")
+    (wheel,) = libraries.glob("tritonclient-*.whl")
     with zipfile.ZipFile(wheel) as archive:
         name = next(entry for entry in archive.namelist() if entry.endswith("/perf_analyzer"))
-        program = Path(archive.extract(name, folder))
-    program.chmod(0o755)
+        (libraries / "perf_analyzer").write_bytes(archive.read(name))
+    wheel.unlink()
     installed = find_installation().wheel
     assert installed is not None  # only a wheel has the libraries
-    (libraries := folder / "lib").mkdir()
     for library in LIBRARIES:
         stem, suffix = library.split(".so", 1)
         (source,) = (installed.parents[1] / "nvidia_pytriton.libs").glob(f"{stem}-*.so{suffix}*")
-        (libraries / library).symlink_to(source)
-    return program, {"LD_LIBRARY_PATH": str(libraries)}
+        shutil.copy(source, libraries / library)
+    program = libraries.parent / "perf_analyzer"
+    program.write_text(SCRIPT)
+    for file in (program, libraries / "perf_analyzer"):
+        file.chmod(0o755)
+    return program
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """``make chaos``: cause faults under load, check every answer, and report the outcomes of all calls.
 
-    chaos.py faults     processes killed, stopped and hung, a crash loop
+    chaos.py faults     processes killed, stopped and hung, a crash loop, a greedy caller
     chaos.py rollout    two versions take turns on one server
     chaos.py requests   malformed requests: schemathesis against the gateway, spoilt messages against Triton
     chaos.py soak       no fault: at half of the possible rate, memory and latency stay constant

@@ -9,15 +9,18 @@ import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import httpx
+import numpy as np
 import psutil
 
 import rfm_export
 from callers import Callers, Exam, direct, through_gateway
+from client_commands import RFM_CLIENT
 from commands import is_alive
 from paths import ROOT
 from repositories import answering
@@ -37,6 +40,8 @@ SILENT_S = 10.0  # rfm serve's default
 GONE_S = 5.0  # until all processes of a killed rfm serve have ended
 IDLE = 1300  # connections; more than the usual descriptor limit, 1024
 DIES = "import os\n\nos._exit(1)\n"
+STILL_S = 20.0
+SMALL, SMALL_PAUSE_S, FAIR_S = 10, 0.1, 8.0
 LOOP_S = 120.0  # six or more Triton starts
 MODEL_FAULTS = answering("""
     for fault in ("hang", "break"):  # once, by the instance that takes the file
@@ -225,17 +230,84 @@ def crash_loop(site: Site) -> list[Row]:
     return [row]
 
 
-def kill_gateway(site: Site) -> list[Row]:
-    """Kill the gateway. Gateway callers lose their connection; Triton callers are not affected."""
-    process = site.gateway
-    with site.callers(CALLERS // 2) as beside, site.gateway_callers() as callers:
-        process.kill()
-        healed_s = wait_for(lambda: not process.is_running()) + site.wait_healthy()
+def healed_gateway(name: str, number: signal.Signals, noticed_s: float = 0.0) -> Callable[[Site], list[Row]]:
+    """Return a test that sends the gateway a signal. Its callers lose their connection; Triton's are not affected.
+
+    noticed_s: as in ``healed``
+    """
+
+    def cause(site: Site) -> list[Row]:
+        process = site.gateway
+        with site.callers(CALLERS // 2) as beside, site.gateway_callers() as callers:
+            process.send_signal(number)
+            healed_s = wait_for(lambda: not process.is_running()) + site.wait_healthy()
+            callers.wait_for_all()
+            beside.wait_for_all()
+        row = Row(name, callers, healed_s, may_break_off=True)
+        most_s = noticed_s + HEALED_S
+        row.expect(healed_s <= most_s, f"healed after {healed_s:.1f} s; allowed: {most_s:g} s")
+        return [row, Row("  callers beside it, over gRPC", beside)]
+
+    cause.__name__ = name
+    return cause
+
+
+def stand_still(site: Site) -> list[Row]:
+    """Stop all processes for a while, as a machine that stands still does."""
+    serve = psutil.Process(site.served.process.pid)
+    processes = [serve, *serve.children(recursive=True)]
+    with site.callers() as callers, site.gateway_callers() as beside:
+        for process in processes:
+            process.suspend()
+        time.sleep(STILL_S)
+        for process in processes:
+            process.resume()
+        healed_s = site.served.wait_ready() + site.wait_healthy()
         callers.wait_for_all()
         beside.wait_for_all()
-    row = Row("kill -9 of the gateway", callers, healed_s, may_break_off=True)
-    row.expect(healed_s <= HEALED_S, f"healed after {healed_s:.1f} s; allowed: {HEALED_S:g} s")
-    return [row, Row("  callers beside it, over gRPC", beside)]
+    restarts = {what: site.restarts(what) for what in (TRITON, MODEL, OTHER, GATEWAY)}
+    told = ", ".join(f"{count:.0f} of {what}" for what, count in restarts.items() if count)
+    row = Row(f"SIGSTOP of all processes for {STILL_S:g} s", callers, healed_s, f"restarts: {told or 'none'}")
+    return [row, Row("  callers through the gateway", beside, may_break_off=True)]
+
+
+def killed_in_rollout(what: str) -> Callable[[Site], list[Row]]:
+    """Return a test that kills Triton, or a process of the served version, while a rollout loads the next version."""
+    name = f"kill -9 of {'Triton' if what == TRITON else 'a model process'} in a rollout"
+
+    def cause(site: Site) -> list[Row]:
+        repository, before = site.folder / "model_repository", site.restarts(what)
+        version = str(rfm_export.export(CHECKPOINT, repository, ExportConfig(num_gpus=0, torch_threads=1)))
+        served = set(site.served.model_processes())
+        with site.callers() as callers, ThreadPoolExecutor(1) as thread:
+            rollout = thread.submit(site.models, "rollout", MODEL, version)
+            wait_for(lambda: set(site.served.model_processes()) - served)
+            os.kill(site.served.triton if what == TRITON else min(served), signal.SIGKILL)
+            began_s = time.monotonic()
+            told = "the rollout went back" if rollout.exception() else "the rollout went on"
+            site.served.wait_ready()
+            healed_s = time.monotonic() - began_s
+            callers.wait_for_all()
+        return [Row(name, callers, healed_s, f"{site.restarts(what) - before:.0f} restarts; {told}")]
+
+    cause.__name__ = name
+    return cause
+
+
+def greedy(site: Site) -> list[Row]:
+    """Let one client send thousands of samples at once beside callers that each send one sample ten times a second."""
+    with site.callers(SMALL, pause_s=SMALL_PAUSE_S) as alone:
+        time.sleep(FAIR_S)
+    words = ["sample", "--num-samples", "10000", "--num-frames", "16", "--url", site.served.endpoints.grpc_url]
+    with site.callers(SMALL, pause_s=SMALL_PAUSE_S) as beside:
+        began_s = time.monotonic()
+        done = subprocess.run([RFM_CLIENT, *words, "--json", site.folder / "greedy.json"], capture_output=True)
+        took_s = time.monotonic() - began_s
+    p99s = [1e3 * float(np.percentile(each.latencies_s, 99)) for each in (beside, alone)]
+    row = Row(f"{SMALL} small callers beside a greedy one", beside)
+    row.told = f"p99 {p99s[0]:.0f} ms, alone {p99s[1]:.0f} ms; 10,000 samples at once took {took_s:.1f} s"
+    row.expect(done.returncode == 0, f"the greedy one: {done.stderr.decode()[-300:]}")
+    return [row]
 
 
 def kill_serve(site: Site) -> list[Row]:
@@ -312,10 +384,15 @@ FAULTS: tuple[Callable[[Site], list[Row]], ...] = (
     healed(f"a batch hangs (hang_s: {HANG_S})", lambda site: site.trigger("hang"), MODEL, noticed_s=1.1 * HANG_S),
     # Three failed batches in a row end the model process; callers in the first two get errors.
     healed("a broken context (simulated)", lambda site: site.trigger("break"), MODEL, may_lose=2 * CALLERS),
-    kill_gateway,
+    healed_gateway("kill -9 of the gateway", signal.SIGKILL),
+    healed_gateway("SIGSTOP of the gateway", signal.SIGSTOP, noticed_s=SILENT_S),
+    stand_still,
     kill_serve,
     full_disk,
     dead_load,
+    killed_in_rollout(TRITON),
+    killed_in_rollout(MODEL),
+    greedy,
     idle_connections,
     crash_loop,
 )

@@ -34,7 +34,7 @@ class RfmCommands(command.Commands):
     """Command group for ``rfm``, which refers to ``rfm-client`` for commands that exist only there."""
 
     program, other_program = "rfm", "rfm-client"
-    elsewhere = ("score", "compare", "status", "wait", "sample", "evaluate")
+    elsewhere = ("score", "compare", "status", "wait", "sample", "bench", "evaluate")
     missing: ClassVar[dict[str, str]] = {"label": "pip install ./client ./apps/labels ."}
 
 

@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from gateways import running
 from in_process import rfm_client_app
 from proxies import Proxy
 from rfm_client import InvalidSampleError, RewardClient, ServerError, Trajectory
+from rfm_client.cli.bench import Load, measure
 from rfm_client.command_line import ExitCode
 from servers import Endpoints, RepositoryApi, Served, folder_server, wait_for
 from trajectories import random_trajectory
@@ -131,6 +133,52 @@ def test_synthetic_samples_are_frames_where_embeddings_are_not_read(engines: Eng
     assert "progress of random frames" in result.stdout
 
 
+LOADS: dict[str, tuple[list[object], int, bool]] = {  # options, steps, whether the load is held
+    "embeddings": (["--robots", 3, "--hz", 0.5, "--seconds", 4], 6, True),
+    "frames": (["--robots", 2, "--hz", 0.5, "--seconds", 2, "--use-frames", "--size", 48, "--frames", 4], 2, True),
+    "too many": (["--robots", 1, "--hz", 1000, "--seconds", 1, "--timeout", 20], 1000, False),
+}
+
+
+@pytest.mark.parametrize(("words", "steps", "is_held"), LOADS.values(), ids=LOADS)
+def test_bench_tells_whether_the_server_holds_a_load(
+    demo_server: Endpoints, words: list[object], steps: int, is_held: bool
+) -> None:
+    result = invoke("bench", "--url", demo_server.grpc_url, *words, "--json", "-")
+    assert (result.exit_code, result.stderr) == (ExitCode.OK if is_held else ExitCode.FAILED, "")
+    told = json.loads(result.stdout)
+    assert (told["held"], told["failures"]) == (is_held, {})
+    assert told["asked"] == ("frames" if "--use-frames" in words else "embeddings")
+    assert told["steps"] in range(steps, steps + 4)  # robots begin within a step
+    assert 0 <= told["in_time"] <= 1
+    assert 0 < told["p50_ms"] <= told["p99_ms"]
+    assert told["steps_per_s"] > 0
+
+
+def test_bench_counts_failed_steps_by_reason(demo_server: Endpoints) -> None:
+    class Failing(RewardClient):
+        """Every second step fails, as at a server that rejects it."""
+
+        num_steps = 0
+
+        def submit(self, sample: Any, **options: Any) -> Future[Any]:
+            self.num_steps += 1
+            if self.num_steps % 2:
+                return super().submit(sample, **options)
+            failed: Future[Any] = Future()
+            failed.set_exception(ServerError("the queue is full"))
+            return failed
+
+    load = Load(robots=1, hz=4, seconds=1)
+    with Failing(demo_server.grpc_url) as client:
+        measured = measure(client, load)
+    assert measured.failures == {"the queue is full": 2}
+    assert measured.in_time <= 0.5
+    assert not measured.is_held
+    assert "2 failed: the queue is full\n" in measured.report(load)
+    assert "not held" in measured.report(load)
+
+
 def free_url() -> str:
     with silent_server() as (url, _):
         return url
@@ -230,7 +278,7 @@ def test_exit_codes_are_documented_with_every_command() -> None:
     for code in ExitCode:
         assert re.search(rf"\b{code.value} ", exit_codes), code
     commands = get_command(rfm_client_app).commands  # type: ignore[attr-defined]
-    assert len(commands) == 8
+    assert len(commands) == 9
     for name in commands:
         assert exit_codes in " ".join(invoke(name, "--help").stdout.split())
 

@@ -83,6 +83,10 @@ USAGE = {
     ),
     "rfm-client compare a.mp4": "Invalid value for VIDEO: expected at least 2 videos, got 1",
     "rfm-client sample --num-frames 8-4": bad("--num-frames", "expected a whole number, got '8-4'"),
+    "rfm-client bench --hz 0": bad("--hz", "expected at least 0.01, got 0.0"),
+    "rfm-client bench --hz 0.1 --seconds 5": bad(
+        "--seconds", "expected at least 10, which a step at this rate takes, got 5.0"
+    ),
     "rfm-client --task x score a.mp4": "No such option: --task",
     "rfm-client serve my_models": "No such command 'serve': that is `rfm serve`",
     f"rfm-client gateway --triton {NOBODY} --metrics-url nope": bad(

@@ -59,6 +59,7 @@ SERVED_AS = {  # placeholders of the guides, and values of this server and datas
     "--model first": "--model rfm",
     "--model second": "--model rfm",
     "--episodes 0:20": "--episodes 0:8",
+    "--robots 8 --hz 10": "--robots 1 --hz 0.5 --seconds 2",
 }
 
 

@@ -7,17 +7,21 @@ import importlib.metadata
 import logging
 import time
 from contextlib import nullcontext
+from dataclasses import asdict
 from importlib.metadata import entry_points
 from typing import Annotated
 
 import typer
 
+from rfm_client.async_client import DEFAULT_IN_FLIGHT
 from rfm_client.cli import comparing, documents, scoring
+from rfm_client.cli.bench import Load, measure
 from rfm_client.cli.command import (
     EXIT_CODES,
     MOST_COLUMNS,
     Command,
     Commands,
+    ExitCode,
     exit_code_of,
     report,
     usage_errors,
@@ -225,6 +229,26 @@ def sample(
         typer.echo(scores_table(f"{synthetic.sample_type} of random {of}", rows))
     output.write_json(documents.samples_document(server, synthetic.sample_type, outcomes))
     raise typer.Exit(exit_code_of(failures, some_succeeded=len(failures) < len(outcomes)))
+
+
+@app.command(cls=Command, epilog=EXIT_CODES)
+@with_options
+def bench(load: Load, output: JsonOutput, server: ServerOptions) -> None:
+    """Tell whether the server holds a number of robots. Exit code 1: it does not.
+
+    Each robot asks once per step, also while its earlier answers are late, about random embeddings or about an episode
+    to which it adds a random frame. Time counts from when the step is due. The load is held if 99 % of the steps are
+    answered before the next one is due, and none fails.
+
+    Example: rfm-client bench --robots 8 --hz 10
+    """
+    output.begin()
+    with server.connected(max_in_flight=max(DEFAULT_IN_FLIGHT, load.robots)) as client:
+        measured = measure(client, load)
+    if output.prints_tables:
+        typer.echo(measured.report(load))
+    output.write_json({**server.origin, **asdict(load), **asdict(measured), "held": measured.is_held})
+    raise typer.Exit(ExitCode.OK if measured.is_held else ExitCode.FAILED)
 
 
 def _report_subsampled(name: str, num_scored: int, num_frames: int) -> None:

@@ -20,6 +20,7 @@ from rfm_client.async_client import DEFAULT_TIMEOUT_S
 from rfm_client.cli.command import STANDARD_OUTPUT, usage_errors
 from rfm_client.client import RewardClient
 from rfm_client.contract.checks import require
+from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import InvalidSampleError, InvalidValueError, ModelNotFoundError, RewardError
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, random_trajectory
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
@@ -102,9 +103,9 @@ class ServerOptions(CredentialFiles):
             return RewardClient(urls or self.urls, model=self.model, **given)
 
     @contextmanager
-    def connected(self) -> Iterator[RewardClient]:
+    def connected(self, **options: Any) -> Iterator[RewardClient]:
         """Yield a client if a server answers and serves the model. Otherwise raise RewardError at once."""
-        with self.client() as client:
+        with self.client(**options) as client:
             problems: list[RewardError] = []
             for url in self.urls:
                 if (problem := self._problem(url)) is None:
@@ -293,6 +294,14 @@ class OutputOptions(JsonOutput):
     )
 
 
+def asked_model(client: RewardClient, *, use_frames: bool) -> ModelInfo:
+    """Return the model for embeddings, or with ``use_frames``, or without it, that for frames. Raises RewardError."""
+    if not use_frames:
+        with suppress(ModelNotFoundError):
+            return client.model_info()
+    return client.model_info(frames=True)
+
+
 @dataclass(frozen=True)
 class SyntheticSamples(Settings):
     """Synthetic samples: type, number, and trajectory length."""
@@ -306,11 +315,7 @@ class SyntheticSamples(Settings):
 
     def samples(self, client: RewardClient) -> list[Sample]:
         """Return samples with the served checkpoint's widths. Raises ModelNotFoundError if no model takes them."""
-        info = None
-        if not self.use_frames:
-            with suppress(ModelNotFoundError):
-                info = client.model_info()
-        widths = (info or client.model_info(frames=True)).widths
+        widths = asked_model(client, use_frames=self.use_frames).widths
         random = np.random.default_rng(0)
         kinds = {"progress": ProgressSample, "preference": PreferenceSample, "similarity": SimilaritySample}
         count = 1 if self.sample_type == "progress" else 2
