@@ -16,7 +16,7 @@ from PIL import Image, ImageOps, PngImagePlugin
 from pictures import numbered, numbers
 from rfm_client import UInt8Array
 from rfm_labels import DatasetError, open_dataset
-from rfm_labels.datasets.folders import in_order_of_numbers
+from rfm_labels.datasets.pictures_in_order import in_order_of_numbers
 from rfm_labels.datasets.stored_files import digest_of, file_identity
 
 TASK = "stack the cups"

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.datasets.lerobot_meta import EPISODES_FILE, column_types, json_lines, read_table
+from rfm_labels.datasets.readers import is_reader, read_episodes
 from rfm_labels.label_files import read_label_table, reward_name
 from rfm_labels.metadata import PROGRESS, SUCCESS
 from rfm_labels.summary import BACKWARDS_BY, voted_success
@@ -128,14 +129,18 @@ def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool | None] |
 def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool | None]:
     """Return each episode's outcome by number; None for null, NaN or an empty cell. Raises DatasetError.
 
-    source: a CSV file with the columns ``episode`` and ``success``, or a LeRobot column: per frame, where the last
-        value counts, or per episode. Values: true, false, 1 or 0
-    dataset: the LeRobot dataset's folder
+    source: a CSV file with the columns ``episode`` and ``success``; a LeRobot column: per frame, where the last value
+        counts, or per episode; or a reader, ``FILE.py:FUNCTION``. Values: true, false, 1 or 0
+    dataset: the folder of the LeRobot dataset, or of the reader's recordings
     """
+    if is_reader(source):
+        require("outcome", dataset is not None, "the folder of the recordings with a reader", "none")
+        episodes = read_episodes(source, dataset or Path())
+        return {number: None if each.success is None else bool(each.success) for number, each in enumerate(episodes)}
     if Path(source).suffix.lower() == ".csv":
         return _of_csv(Path(source))
     if dataset is None or not (dataset / "meta").is_dir():
-        raise DatasetError.at("outcome", "a CSV file, or a column of a local LeRobot dataset", repr(source))
+        raise DatasetError.at("outcome", "a CSV file, a column of a local LeRobot dataset, or a reader", repr(source))
     frames, episodes = (
         sorted(dataset.glob(pattern)) for pattern in ("data/**/*.parquet", "meta/episodes/**/*.parquet")
     )

@@ -45,8 +45,8 @@ def evaluate(
     outcome: Annotated[
         str | None,
         typer.Option(
-            help="Outcomes of the episodes: a CSV file (episode, success), or a column of a LeRobot dataset.",
-            metavar="COLUMN|FILE.csv",
+            help="Outcomes of the episodes: a CSV file (episode, success), a column of a LeRobot dataset, or a reader.",
+            metavar="COLUMN|FILE.csv|FILE.py:FUNCTION",
             show_default=False,
         ),
     ] = None,

@@ -201,6 +201,7 @@ class Dataset(ABC):
     left_out: pictures that cannot be scored, with the reason; not in ``cameras``
     numbers: all episode numbers, in order
     filter_keys: episode numbers by filter key or split, such as ``train``
+    fps: frames per second, for the page; None: unknown
     given_task: the caller's task
     corrections: how ``frames`` makes stored frames upright RGB, by camera; other cameras stay as stored
     notes: lines for the caller to read before scoring
@@ -216,6 +217,7 @@ class Dataset(ABC):
     left_out: Mapping[str, str] = {}
     numbers: Sequence[int] = ()
     filter_keys: Mapping[str, Sequence[int]] = {}
+    fps: float | None = None
     given_task: TaskOverride = TaskOverride()
     corrections: Mapping[str, Correction] = {}
     notes: Sequence[str] = ()

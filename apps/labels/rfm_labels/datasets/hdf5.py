@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""HDF5 files from robomimic and LIBERO (``data/demo_<i>/obs/<camera>``), IsaacLab-Arena, ALOHA, RoboTwin and others.
+"""HDF5 files from robomimic, LIBERO (``data/demo_<i>/obs/<camera>``) and IsaacLab-Arena. Needs ``rfm-labels[hdf5]``.
 
-Needs ``rfm-labels[hdf5]``. Episodes are named ``demo_<i>`` in all layouts.
+The task is the demonstration's own (``ep_meta``), else LIBERO's sentence (``problem_info`` of ``data``), robomimic's
+(``env_args``), or the caller's. LIBERO stores pictures upside down: they are turned, unless the caller says otherwise.
+robomimic's filter keys (``mask/train``) name some demonstrations.
 
-In robomimic and LIBERO files the task is the demonstration's own (``ep_meta``), else LIBERO's sentence
-(``problem_info`` of ``data``), robomimic's (``env_args``), or the caller's. LIBERO stores pictures upside down: they
-are turned, unless the caller says otherwise. robomimic's filter keys (``mask/train``) name some demonstrations.
+IsaacLab-Arena keeps pictures in ``camera_obs``. The first shows the end of the demonstration before, and is left out,
+as by Arena's converter to LeRobot.
 """
 
 from __future__ import annotations
@@ -16,32 +17,24 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from rfm_client import RewardError, UInt8Array
-from rfm_client.frames import Orientation, Picture
+from rfm_client.frames import Orientation
 from rfm_labels.datasets.dataset import AskedCorrections, CountedDataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, FaultsError, require
-from rfm_labels.datasets.hdf5_layouts import (
-    ROBOMIMIC,
-    ROBOTWIN,
-    Layout,
+from rfm_labels.datasets.hdf5_contents import (
+    DOCUMENTS,
     attribute,
+    demonstrations,
+    fault_of,
     filter_keys,
+    form_of,
     fps_of,
-    instructions_of,
     is_of_libero,
-    layout_of,
+    may_be_picture,
+    members_of,
+    observations,
     opened_hdf5,
     task_of,
-    task_places,
     unread_documents,
-)
-from rfm_labels.datasets.hdf5_pictures import (
-    EncodedFrames,
-    fault_of,
-    first_file,
-    form_of,
-    has_rgb_mark,
-    is_encoded,
-    may_be_picture,
 )
 from rfm_labels.datasets.stored_files import digest_of
 
@@ -50,6 +43,8 @@ SUFFIXES = (".hdf5", ".h5")
 _FRAMES_AT_A_TIME = 64
 _LIBERO: Orientation = "flip-vertical"  # as in upstream's training data and evaluation
 _LIBERO_CAMERAS = ("agentview_rgb", "eye_in_hand_rgb")
+_ARENA, _ARENA_FPS = "camera_obs", 50.0
+_RENDER = "robomimic's dataset_states_to_obs.py renders the pictures of a low-dimensional file"
 
 
 @dataclass(frozen=True)
@@ -61,7 +56,6 @@ class _Demo:
     faults: by observation, why it is no camera's frames; empty: it is
     pictures: observations that may be pictures
     lengths: frame count by camera
-    marks: by camera whose frames are files, whether the first has RoboTwin's mark of RGB
     num_actions: None: not in the file
     """
 
@@ -72,32 +66,25 @@ class _Demo:
     faults: Mapping[str, str]
     pictures: Sequence[str]
     lengths: Mapping[str, int]
-    marks: Mapping[str, bool]
     num_actions: int | None
 
     @classmethod
-    def read(cls, name: str, group: Any, task: Any, layout: Layout) -> _Demo:
-        observations = layout.observations(group)
-        are_pictures, skipped = layout.are_pictures, layout.skipped
+    def read(cls, name: str, group: Any, task: Any, folder: str, skipped: int) -> _Demo:
+        found = observations(group, folder)
         faults = {
-            each: f"{name} has a broken link or no array" if value is None else fault_of(value, are_pictures)
-            for each, value in observations.items()
+            each: f"{name} has a broken link or no array" if value is None else fault_of(value)
+            for each, value in found.items()
         }
-        cameras = {each: observations[each] for each, fault in faults.items() if not fault}
-        actions = getattr(group.get(layout.actions) if cameras and layout.actions else None, "shape", None)
+        cameras = {each: found[each] for each, fault in faults.items() if not fault}
+        actions = getattr(group.get("actions") if cameras else None, "shape", None)
         return cls(
             name,
             task,
             f"{name} is a broken link" if group is None else f"missing in {name}",
-            {each: form_of(value) for each, value in observations.items()},
+            {each: form_of(value) for each, value in found.items()},
             faults,
-            [each for each, value in observations.items() if may_be_picture(value, are_pictures)],
+            [each for each, value in found.items() if may_be_picture(value)],
             {each: len(value) - skipped for each, value in cameras.items()},
-            {
-                each: has_rgb_mark(first_file(value))
-                for each, value in cameras.items()
-                if is_encoded(value, are_pictures)
-            },
             actions[0] - skipped if actions else None,
         )
 
@@ -142,66 +129,43 @@ class Hdf5Dataset(CountedDataset):
         self.source = file.name
         self.given_task = task
         with opened_hdf5(file) as opened:
-            self._layout = layout = layout_of(opened)
-            groups = layout.episodes(file, opened)
-            attributes = (opened["data"] if layout.is_in_data else opened).attrs
+            groups, attributes = demonstrations(file, opened), opened["data"].attrs
+            is_arena = any(_ARENA in members_of(group) for _, group in groups.values())
+            self._folder, self._skipped = (_ARENA, 1) if is_arena else ("obs", 0)
             self._demos = {
-                number: _Demo.read(name, group, task_of(file, opened, group, layout), layout)
+                number: _Demo.read(name, group, task_of(opened, group), self._folder, self._skipped)
                 for number, (name, group) in groups.items()
             }
             self.filter_keys = filter_keys(opened)
             self._broken = unread_documents(attributes)
-            is_libero = layout is ROBOMIMIC and is_of_libero(attributes)
-            self.fps = layout.fps or fps_of(attributes)
+            is_libero = not is_arena and is_of_libero(attributes)
+            self.fps = _ARENA_FPS if is_arena else fps_of(attributes)
             is_upright = "opencv" in str(attribute(attributes, "macros_image_convention"))  # robosuite turned frames
-        self.kind = "HDF5" if layout is ROBOMIMIC else f"HDF5 ({layout.name})"
+        self.kind = "HDF5 (IsaacLab-Arena)" if is_arena else "HDF5"
         self.numbers = list(self._demos)
         self._pictures = list(dict.fromkeys(each for demo in self._demos.values() for each in demo.pictures))
         self.cameras, self.left_out = self._shared(self.numbers)
         known = [each for each in self._pictures if any(each in demo.lengths for demo in self._demos.values())]
         if not known:
             self.cameras_in(self.numbers)  # raises the reason
-        self._marks = {camera: mark for demo in self._demos.values() for camera, mark in demo.marks.items()}
-        unmarked = [camera for camera, mark in self._marks.items() if layout is ROBOTWIN and not mark]
         defaults: dict[str, Orientation] = dict.fromkeys(known, _LIBERO) if is_libero and not is_upright else {}
-        self.corrections = corrections.of_cameras(known, defaults, dict.fromkeys(unmarked, "bgr"))
+        self.corrections = corrections.of_cameras(known, defaults)
         uncorrected = [camera for camera in known if {"", camera}.isdisjoint(corrections.orient)]
         why = "is not a JSON object, so it states neither a task nor LIBERO"
         self.notes = [f"data: {name} {why}" for name in self._broken]
         self.notes += [] if is_upright else _notes(uncorrected, is_libero)
-        self.notes += self._notes_on_colours(corrections, unmarked) + self._notes_on_layout()
-
-    def _notes_on_layout(self) -> list[str]:
-        if self._layout is ROBOMIMIC:
-            return []
-        forms = [f"{camera}{' (JPEG or PNG)' * (camera in self._marks)}" for camera in self.cameras]
-        notes = [f"layout: {self._layout.name}, cameras {', '.join(forms)}"]
-        if self._layout.skipped:
-            notes.append(
-                "left out: each first picture, which shows the end of the episode before; frame 0 is the second"
-            )
-        instructions = instructions_of(self.file) if self._layout is ROBOTWIN else []
-        if instructions and self._demos[0].task == instructions[0] and self.given_task.text is None:
-            notes.append(f"task: the first of {len(instructions)} sentences in instructions/{self.file.stem}.json")
-        return notes
-
-    def _notes_on_colours(self, asked: AskedCorrections, unmarked: Sequence[str]) -> list[str]:
-        """A note on red and blue, for cameras without a channel order from the caller."""
-        uncorrected = [camera for camera in self._marks if {"", camera}.isdisjoint(asked.channels)]
-        swapped = [camera for camera in uncorrected if camera in unmarked]
-        if swapped:
-            why = "RoboTwin's JPEG files without its mark of RGB, from before September 2026, store red as blue"
-            return [f"channels: {', '.join(swapped)} bgr ({why}; --channels rgb leaves them)"]
-        colours = self._layout.colours
-        return [f"channels: {', '.join(uncorrected)} {colours}"] if uncorrected and colours else []
+        if is_arena:
+            why = "which shows the end of the episode before; frame 0 is the second"
+            self.notes += [f"layout: IsaacLab-Arena; left out: each first picture, {why}"]
 
     def length(self, number: int) -> int:
         return self._demos[number].num_frames(self.cameras)
 
     def read_episode(self, number: int) -> DatasetEpisode:
         demo = self._demos[number]
-        where = f"{self.file}: {self._layout.group_of(demo.name)}".removesuffix(": ")
-        task = self.given_task.of(f"{where}: {task_places(self.file, self._layout, self._broken)}", demo.task)
+        where = f"{self.file}: data/{demo.name}"
+        documents = " or ".join(name + " (no JSON object)" * (name in self._broken) for name in DOCUMENTS)
+        task = self.given_task.of(f"{where}: ep_meta, or data: {documents}", demo.task)
         counts = ", ".join(f"{key} {count}" for key, count in demo.counts(self.cameras).items())
         require(where, self.length(number) > 0, "one length, above 0", counts or _described(demo.forms))
         return DatasetEpisode(number, demo.name, task, self.length(number), self.frames_before(number))
@@ -222,9 +186,9 @@ class Hdf5Dataset(CountedDataset):
             demo = self._demos[number]
             own = {name: fault for name in self._pictures if (fault := demo.fault(name))}
             got = "; ".join(map(": ".join, (left_out if whole else own).items()))
-            got = got or f"{_described(demo.forms)}: {self._layout.without_pictures}"
+            got = got or f"{_described(demo.forms)}: {_RENDER}"
             expected = "a camera as uint8 [T, H, W, 3]" + " in every demonstration" * whole
-            faults[number] = DatasetError.at(f"{self.file}: {self._layout.cameras_at(demo.name)}", expected, got)
+            faults[number] = DatasetError.at(f"{self.file}: data/{demo.name}/{self._folder}", expected, got)
         raise faults[numbers[0]] if whole else FaultsError.of(faults, numbers)
 
     def _shared(self, numbers: Sequence[int]) -> tuple[Sequence[str], Mapping[str, str]]:
@@ -234,50 +198,35 @@ class Hdf5Dataset(CountedDataset):
         cameras = tuple(name for name, fault in faults.items() if not fault)
         return cameras, {name: fault for name, fault in faults.items() if fault}
 
-    def decoder(self, camera: str) -> str | None:
-        return Picture.decoder() if camera in self._marks else None
+    def decoder(self, camera: str) -> None:
+        """Frames are stored as pixels."""
 
     def identity(self, episode: DatasetEpisode, camera: str) -> str:
-        with opened_hdf5(self.file) as opened:
-            if encoded := self._encoded(self._video(opened, episode, camera), episode, camera):
-                return digest_of(encoded.files())
         return digest_of(frame.tobytes() for frame in self.stored_frames(episode, camera))
 
     def check(self, episode: DatasetEpisode, camera: str) -> None:
         with opened_hdf5(self.file) as opened:
-            if encoded := self._encoded(self._video(opened, episode, camera), episode, camera):
-                encoded.check()
+            self._video(opened, episode, camera)
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         with opened_hdf5(self.file) as opened:
             video = self._video(opened, episode, camera)
-            if encoded := self._encoded(video, episode, camera):
-                yield from encoded.pixels()
-                return
-            for start in range(self._layout.skipped, len(video), _FRAMES_AT_A_TIME):
+            for start in range(self._skipped, len(video), _FRAMES_AT_A_TIME):
                 try:
                     yield from video[start : start + _FRAMES_AT_A_TIME]
                 except OSError as error:
                     raise DatasetError.at(self.place(episode, camera), "readable frames", error) from error
 
-    def _encoded(self, video: Any, episode: DatasetEpisode, camera: str) -> EncodedFrames | None:
-        """The frames as files; None: they are pixels."""
-        if not is_encoded(video, self._layout.are_pictures):
-            return None
-        stored = video[self._layout.skipped :] if self._layout.skipped else video
-        return EncodedFrames(stored, self.place(episode, camera))
-
     def _video(self, opened: Any, episode: DatasetEpisode, camera: str) -> Any:
-        video = opened.get(self._layout.path_of(episode.name, camera))
-        is_whole = video is not None and not fault_of(video, self._layout.are_pictures)
-        num_pictures = episode.num_frames + self._layout.skipped
-        is_video = is_whole and len(video) == num_pictures
+        video = opened.get(f"data/{episode.name}/{self._folder}/{camera}")
+        num_pictures = episode.num_frames + self._skipped
+        is_video = video is not None and not fault_of(video) and len(video) == num_pictures
         got = "none" if video is None else form_of(video)
         require(self.place(episode, camera), is_video, f"uint8 [{num_pictures}, H, W, 3]", got)
         return video
 
     def place(self, episode: DatasetEpisode, camera: str) -> str:
-        return f"{self.file}: {self._layout.path_of(episode.name, camera)}"
+        return f"{self.file}: data/{episode.name}/{self._folder}/{camera}"
 
 
 def _described(forms: Mapping[str, str]) -> str:

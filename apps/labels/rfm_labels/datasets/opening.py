@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Open a dataset by path or Hub id, or explain how to convert an unsupported layout.
+"""Open a dataset by path or Hub id, by a pattern or by a reader, or explain how to open an unknown layout.
 
 ``tasks.csv`` lists a folder's episodes in order. The columns ``video`` (or ``episode``) and ``task`` are separated by
 commas, semicolons or tabs. Quote a task that contains the separator. Paths are relative to the table.
@@ -11,31 +11,23 @@ import csv
 import io
 import os
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any
 
 from rfm_client.frames import ARRAY_SUFFIXES, ChannelOrder, Orientation, cached_snapshot
 from rfm_client.options import first_names
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER, AskedCorrections, Dataset, SeveralTasks, TaskOverride
+from rfm_labels.datasets.episodes import Episode, EpisodeDataset, Frames
 from rfm_labels.datasets.faults import DatasetError, FaultsError, require, shortened
-from rfm_labels.datasets.folders import (
-    PICTURE_SUFFIXES,
-    ArrayFiles,
-    EpisodeFiles,
-    FrameFolders,
-    UnitreeFolders,
-    VideoFolder,
-    in_natural_order,
-    is_of_unitree,
-    is_pattern,
-    is_picture,
-)
 from rfm_labels.datasets.hdf5 import SUFFIXES, Hdf5Dataset, is_hdf5
 from rfm_labels.datasets.lerobot import LeRobotDataset
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
 from rfm_labels.datasets.lerobot_meta import INFO_FILE, Info
 from rfm_labels.datasets.lerobot_rows import TASK_COLUMN
+from rfm_labels.datasets.patterns import files_below, files_of_pattern, suggested_pattern
+from rfm_labels.datasets.pictures_in_order import PICTURE_SUFFIXES, in_natural_order, is_picture
+from rfm_labels.datasets.readers import Reader, open_read
 from rfm_labels.datasets.rlds import RldsDataset, rlds_folder
 from rfm_labels.datasets.rlds_files import FEATURES_FILE
 
@@ -48,26 +40,24 @@ _LAYOUTS = (
     f"folder of videos, of folders of pictures or of {' and '.join(ARRAY_SUFFIXES)} files with {TABLE}, "
     "or a Hub id org/name[@revision]"
 )
-_CONVERT = "convert them to LeRobot, or write each episode's pictures to a video and list the videos in tasks.csv"
+_READER = "write a reader of ten lines (--reader; examples/readers)"
 _GIVE_TASK = '--task "SENTENCE"'
 _FILL = "put a video, an array or a folder of pictures for each episode in it"
 _UNREAD = {  # remedies for layouts without a reader, by file name pattern
     r"meta_data": "a LeRobot dataset of v1: convert it to v2.0 with LeRobot 0.3",
     r".*\.tfrecord.*": f"TFRecord files without {FEATURES_FILE}, which TensorFlow Datasets 4.6 or later writes beside "
     "them: copy the whole folder of the version",
-    r".*\.zarr(\.zip)?|\.z(group|array|attrs|metadata)|zarr\.json": f"Zarr arrays: {_CONVERT}",
-    r".*\.(bag|mcap|db3)": f"a rosbag: {_CONVERT}",
+    r".*\.zarr(\.zip)?|\.z(group|array|attrs|metadata)|zarr\.json": f"Zarr arrays: {_READER}",
+    r".*\.(bag|mcap|db3)": f"a rosbag: {_READER}",
 }
 _VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov", ".webm", ".avi")
 _SUFFIXES = {"videos": _VIDEO_SUFFIXES, "arrays": ARRAY_SUFFIXES, "HDF5 files": SUFFIXES, "pictures": PICTURE_SUFFIXES}
-_KINDS: dict[str, tuple[type[EpisodeFiles], str]] = {  # reader, and what an episode is called
-    "videos": (VideoFolder, "video"),
-    "folders of pictures": (FrameFolders, "folder"),
-    "arrays": (ArrayFiles, "file"),
-    "recordings of Unitree": (UnitreeFolders, "folder"),
+_KINDS = {  # the dataset's kind, its camera, and what an episode is called
+    "videos": ("videos", "video", "video"),
+    "folders of pictures": ("folders of frames", "frames", "folder"),
+    "arrays": ("arrays", "frames", "file"),
 }
-_ORDER = ("videos", "arrays", "HDF5 files", "recordings of Unitree", "folders of pictures", "pictures")
-_OWN_TASKS = ("arrays", "recordings of Unitree")
+_ORDER = ("videos", "arrays", "HDF5 files", "folders of pictures", "pictures")
 _OUR_FILES = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside labelled episodes; HDF5: from 0.4
 
 
@@ -122,6 +112,8 @@ def _normal(root: Path, path: str) -> str:
 def open_dataset(
     source: str | Path,
     *,
+    reader: str | Reader | None = None,
+    videos: str | None = None,
     task: str | None = None,
     override_task: bool = False,
     several_tasks: SeveralTasks = "each",
@@ -132,6 +124,9 @@ def open_dataset(
 ) -> Dataset:
     """Open the dataset at a path, or download the Hub id ``org/name[@revision]``. An existing path wins.
 
+    reader: function that yields the episodes of the folder, each an ``Episode``, or its name, ``FILE.py:FUNCTION``
+    videos: pattern for videos, pictures or arrays below the folder, such as ``{episode}/videos/{camera}.mp4`` or
+        ``{episode}/colors/*_{camera}.jpg``
     task: task for episodes without their own
     override_task: True: use ``task`` for all episodes
     several_tasks: if a LeRobot episode has several tasks: ``each``: frames keep their own; ``first``: all frames get
@@ -148,6 +143,14 @@ def open_dataset(
     """
     path, given = Path(source), TaskOverride(task, override_task, several_tasks, task_column)
     corrections = AskedCorrections.of(orient, channels)
+    if reader is not None or videos is not None:
+        require("videos", reader is None or videos is None, "none with a reader, which names the files", videos)
+        require("task_column", task_column is None, "none with a reader or a pattern", task_column)
+        return (
+            _by_pattern(path, videos or "", given, corrections)
+            if reader is None
+            else open_read(reader, path, given, corrections)
+        )
     if (path / INFO_FILE).is_file():
         return LeRobotDataset(path, task=given, corrections=corrections, tolerance_s=tolerance_s)
     if folder := rlds_folder(path):
@@ -214,43 +217,86 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
         raise DatasetError.at(path, _LAYOUTS, _unread(path) or "another file")
     table = path / TABLE if path.is_dir() else path
     if table.is_file():
-        tasks = read_table_of_tasks(table, has_tasks=task.text is None)
-        there = [name for name in tasks if (table.parent / name).exists()] or list(tasks)
-        found = {_kind_of(table.parent / name): name for name in reversed(there)}
+        root, tasks = table.parent, read_table_of_tasks(table, has_tasks=task.text is None)
+        there = [name for name in tasks if (root / name).exists()] or list(tasks)
+        pattern = next((name for name in tasks if "*" in name and not (root / name).exists()), "")
+        got = f"{pattern}: name the pictures by --videos '{{episode}}/{Path(pattern).name}', and folders in the table"
+        require(table, not pattern, "files and folders, and no patterns", got)
+        found = {_kind_of(root / name): name for name in reversed(there)}
         kinds = {kind if kind in _KINDS else "videos": name for kind, name in found.items()}
         examples = " and ".join(f"{kind} ({name})" for kind, name in sorted(kinds.items()))
         require(table, len(kinds) == 1, "episodes of one kind", f"{examples}: write a table for each kind")
         (kind,) = kinds
-        dataset = _KINDS[kind][0](table.parent, tasks, table, task, corrections)
-        dataset.notes = [*dataset.notes, *_unlisted(table, kind, tasks)]
+        dataset = _of_files(root, kind, tasks, table, task, corrections)
+        dataset.notes = _unlisted(table, kind, tasks)
         return dataset
     require(path, path.is_dir(), _LAYOUTS, "neither")
     kind, names = _listed(path)
-    reader, episode = _KINDS[kind]
-    expected, old_table = f"{TABLE} with the task of each {episode}", path / "tasks.json"  # as 0.4 read it
-    got = f"{old_table.name}: write it as {TABLE}, with the columns video and task"
-    require(path, not old_table.is_file(), expected, got)
+    old_table = path / "tasks.json"  # as 0.4 read it
+    expected, got = f"{TABLE} with the task of each {_KINDS[kind][2]}", f"{old_table.name}: write it as {TABLE}"
+    require(path, not old_table.is_file(), expected, f"{got}, with the columns video and task")
+    _check_tasks(path, task.text is not None or kind == "arrays", _KINDS[kind][2])
+    return _of_files(path, kind, dict.fromkeys(names), path, task, corrections)
+
+
+def _check_tasks(folder: Path, are_known: bool, episode: str) -> None:
+    """Raise DatasetError for a folder without a table of tasks, if it needs one."""
     got = f"none: write it, or, if all of them have one task, give it: {_GIVE_TASK}"
-    require(path, task.text is not None or kind in _OWN_TASKS, expected, got)
-    return reader(path, dict.fromkeys(names), path, task, corrections)
+    require(folder, are_known, f"{TABLE} with the task of each {episode}", got)
+
+
+def _of_files(
+    root: Path,
+    kind: str,
+    tasks: Mapping[str, str | None],
+    table: Path,
+    task: TaskOverride,
+    corrections: AskedCorrections,
+) -> EpisodeDataset:
+    """Open one file or folder for each episode. tasks: by path below the root"""
+    shown, camera, _ = _KINDS[kind]
+    episodes = (Episode(name, {camera: root / name}, own) for name, own in tasks.items())
+    return EpisodeDataset(episodes, root, shown, table, task, corrections)
+
+
+def _by_pattern(root: Path, pattern: str, task: TaskOverride, corrections: AskedCorrections) -> EpisodeDataset:
+    """Open the files that match a pattern. A table of tasks names the episodes. Raises DatasetError."""
+    require(root, root.is_dir(), "the folder of the recordings", "a file" if root.exists() else "none")
+    found: Mapping[str, Mapping[str, Frames]] = files_of_pattern(root, pattern)
+    table, tasks = root / TABLE, dict[str, str | None].fromkeys(found)
+    if table.is_file():
+        tasks = dict(read_table_of_tasks(table, has_tasks=task.text is None))
+        missing = [name for name in tasks if name not in found]
+        got = f"{first_names(missing)}; there are {first_names(found)}"
+        require(table, not missing, f"episodes of {pattern}", got)
+    else:
+        _check_tasks(root, task.text is not None, "episode")
+    episodes = (Episode(name, found[name], own) for name, own in tasks.items())
+    where = table if table.is_file() else root
+    dataset = EpisodeDataset(episodes, root, f"pattern {pattern}", where, task, corrections)
+    dataset.notes = _note(table, "episodes", [name for name in found if name not in tasks])
+    return dataset
 
 
 def _unlisted(table: Path, kind: str, names: Collection[str]) -> list[str]:
     """A note on episodes that lie beside the table's but are not listed; empty if there are none."""
-    names = {str(Path(name).parent) if is_pattern(table.parent / name) else name for name in names}
     beside = {table.parent, *((table.parent / name).parent for name in names)} if kind in _SUFFIXES else {table.parent}
     found = [folder / name for folder in sorted(beside) if folder.is_dir() for name in _found(folder).get(kind, ())]
     if kind == "folders of pictures":  # ``_found`` also has folders without pictures
         found = [each for each in found if any(_is_frame(file) for file in each.iterdir())]
-    gone = in_natural_order({Path(os.path.relpath(each, table.parent)).as_posix() for each in found} - set(names))
+    gone = {Path(os.path.relpath(each, table.parent)).as_posix() for each in found} - set(names)
+    return _note(table, kind, in_natural_order(gone))
+
+
+def _note(table: Path, kind: str, gone: Sequence[str]) -> list[str]:
     note = f"{table.name}: {len(gone)} {kind} beside it are not listed and get no labels: {first_names(gone)}"
     return [note] if gone else []
 
 
 def _kind_of(path: Path) -> str | None:
     """What an episode's file or folder is, by name; None: another file."""
-    if path.is_dir() or is_pattern(path):
-        return "recordings of Unitree" if is_of_unitree(path) else "folders of pictures"
+    if path.is_dir():
+        return "folders of pictures"
     return next((kind for kind, suffixes in _SUFFIXES.items() if path.suffix.lower() in suffixes), None)
 
 
@@ -302,11 +348,9 @@ def _unread(path: Path) -> str | None:
         return f"a folder of HDF5 files, each a dataset of its own: {remedy}"
     if any(_is_frame(file) for file in path.iterdir()):
         return "pictures outside of the folder of an episode"
-    suffixes = {**dict.fromkeys(_VIDEO_SUFFIXES, "videos"), **dict.fromkeys(PICTURE_SUFFIXES, "pictures")}
-    shown = (file for file in path.rglob("*") if file.is_file() and not file.name.startswith("."))
-    deeper = next((file for file in shown if file.suffix.lower() in suffixes), None)
+    kinds = {**dict.fromkeys(_VIDEO_SUFFIXES, "videos"), **dict.fromkeys(PICTURE_SUFFIXES, "pictures")}
+    deeper = next((name for name in files_below(path) if Path(name).suffix.lower() in kinds), None)
     if deeper is None:
         return None
-    kind = suffixes[deeper.suffix.lower()]
-    what, listed = ("videos", deeper) if kind == "videos" else ("folders", deeper.parent)
-    return f"{kind} in deeper folders: list the {what} of one camera ({listed.relative_to(path)}) in tasks.csv"
+    remedy = f"name the episode and the camera in their paths, perhaps --videos '{suggested_pattern(path, deeper)}'"
+    return f"{kinds[Path(deeper).suffix.lower()]} in deeper folders ({deeper}): {remedy}; or {_READER}"

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: MIT
+"""Pictures that are an episode's frames, in the order of the numbers in their names: counts or times.
+
+``-1``, ``0.25`` and ``2e-05`` are numbers. Pictures of several cameras in one folder are an error.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+
+from rfm_labels.datasets.faults import DatasetError, require
+
+_NOT_IN_A_WORD = r"(?<![^\W_])"  # after a letter or digit, - and . are separators: frame-1.png, frame.1.png, 2026-11-26
+NUMBER = (
+    rf"(?:{_NOT_IN_A_WORD}-)?"
+    rf"(?:(?<!\d\.)\d+\.\d+(?!\.?\d)|{_NOT_IN_A_WORD}\.\d+|\d+)"  # 1.2.10 has no decimals
+    r"(?:[eE][+-]\d+(?![^\W_]))?"
+)
+_NUMBER = re.compile(f"({NUMBER})")
+_LETTERS = 2  # minimum word length before a camera number; a time may contain one letter, as in 20261126T123000
+_EXAMPLES = 3  # kinds of names in a message
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
+_LEAVE_OUT = "leave it out (--episodes)"
+
+
+@dataclass(frozen=True)
+class _Name:
+    """A file name split into text and numbers. words: the texts around the numbers, then the format."""
+
+    file: str
+    words: tuple[str, ...]
+    digits: tuple[str, ...]
+    numbers: tuple[Decimal, ...]
+
+    @classmethod
+    def of(cls, file: str) -> _Name:
+        parts = _NUMBER.split(Path(file).stem)
+        digits = tuple(parts[1::2])
+        form = Path(file).suffix.lower().replace("jpeg", "jpg")
+        return cls(file, (*parts[::2], form), digits, tuple(map(Decimal, digits)))
+
+    def kind(self, place: int | None) -> str:
+        """The name with ``*`` for all numbers but the one at ``place``."""
+        shown = ["*" if number != place else digits for number, digits in enumerate(self.digits)]
+        parts = [self.words[0], *(part for pair in zip(shown, self.words[1:-1], strict=True) for part in pair)]
+        return "".join(parts) + Path(self.file).suffix
+
+
+def in_order_of_numbers(folder: Path, files: Sequence[str]) -> list[str]:
+    """Sort an episode's file names by their numbers.
+
+    Raises DatasetError for a repeated number, or different kinds of names, such as from several cameras.
+    """
+    names = sorted(map(_Name.of, files), key=lambda name: (name.numbers, name.file))
+    if len({name.words for name in names}) > 1:
+        raise _several_kinds(folder, names, None)
+    for before, name in itertools.pairwise(names):
+        got = f"{before.file} and {name.file}: leave the episode out (--episodes)"
+        require(folder, before.numbers != name.numbers, "each number once", got)
+    places = range(len(names[0].numbers)) if names else ()
+    num_cameras = {place: _num_cameras(names, place) for place in places}
+    of_cameras = [place for place in places if num_cameras[place]]
+    if of_cameras:
+        raise _several_kinds(folder, names, min(of_cameras, key=lambda place: num_cameras[place]))
+    return [name.file for name in names]
+
+
+def _num_cameras(names: Sequence[_Name], place: int) -> int:
+    """How many cameras the numbers at a place count; 0 if they count frames.
+
+    All cameras have the same frames, so names repeat once the camera number is removed. Times such as ``12_500`` (s,
+    ms) may repeat by chance, so either all names must repeat, or the number must belong to a word, as in ``cam1_0001``.
+    """
+    others = Counter(name.numbers[:place] + name.numbers[place + 1 :] for name in names)
+    values = {name.numbers[place] for name in names}
+    word = names[0].words[place][-_LETTERS:]
+    is_in_word = len(word) == _LETTERS and word.isalpha()
+    repeats = 1 < len(others) < len(names)
+    return len(values) if repeats and (is_in_word or len(others) * len(values) == len(names)) else 0
+
+
+def _several_kinds(folder: Path, names: Sequence[_Name], place: int | None) -> DatasetError:
+    """The error for several kinds of names."""
+    kinds: Mapping[str, int] = Counter(name.kind(place) for name in names)
+    shortest = sorted(kinds, key=lambda kind: (len(kind), kind))
+    examples = " and ".join(f"{kind} ({kinds[kind]})" for kind in shortest[:_EXAMPLES])
+    if max(kinds.values()) == 1:
+        remedy = "copy them to a folder of their own, as 0.png and 1.png"
+        return DatasetError.at(folder, "names that differ in a number", f"{examples}: {remedy}")
+    got = f"{examples}: name the cameras, as --videos '{{episode}}/{picture_pattern([name.file for name in names])}'"
+    return DatasetError.at(folder, "pictures of one camera, whose names differ in a number", got)
+
+
+def picture_pattern(files: Iterable[str]) -> str:
+    """Return a pattern for an episode's pictures: ``*`` for the frame's number, ``{camera}`` for names that differ."""
+    files = list(files)
+    suffix, _ = Counter(Path(file).suffix for file in files).most_common(1)[0]
+    split = [_NUMBER.split(Path(file).stem) for file in files if Path(file).suffix == suffix]
+    length, _ = Counter(map(len, split)).most_common(1)[0]
+    split = [parts for parts in split if len(parts) == length]
+    place = max(range(1, length, 2), key=lambda place: len({parts[place] for parts in split}), default=0)
+    before, after = (
+        Counter("".join(parts[:place]) for parts in split),
+        Counter("".join(parts[place + 1 :]) for parts in split),
+    )
+    start, end = before.most_common(1)[0][0], after.most_common(1)[0][0]
+    if len(before) > 1 and len(after) == 1:
+        start = "{camera}" + _separator({text[-1:] for text in before})
+    elif len(after) > 1 and len(before) == 1:
+        end = _separator({text[:1] for text in after}) + "{camera}"
+    return f"{start}*{end}{suffix}"
+
+
+def _separator(characters: set[str]) -> str:
+    """The character that all names have there; empty if it is a letter or digit, or differs."""
+    (character,) = characters if len(characters) == 1 else ("",)
+    return "" if character.isalnum() else character
+
+
+def in_natural_order(names: Iterable[str]) -> list[str]:
+    """Sort episode names, comparing numbers as integers: ``2`` before ``10``, ``1.2`` before ``1.10``.
+
+    ``in_order_of_numbers`` sorts frames, whose numbers may be times.
+    """
+
+    def key(name: str) -> tuple[list[tuple[int, str]], str]:
+        parts = re.split(r"(\d+)", name)
+        return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts], name
+
+    return sorted(names, key=key)
+
+
+def is_picture(file: Path) -> bool:
+    """True for a PNG or JPEG file, by suffix; False for a hidden one."""
+    return file.suffix.lower() in PICTURE_SUFFIXES and not file.name.startswith(".") and file.is_file()
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """List the pictures in an episode's folder in order. Raises DatasetError if there are none, or several kinds."""
+    try:
+        found = [each for each in folder.iterdir() if not each.name.startswith(".")]
+    except OSError as error:
+        raise DatasetError.at(folder, "a folder of PNG or JPEG files", error.strerror) from error
+    names = [each.name for each in found if is_picture(each)]
+    folders = in_natural_order([each.name for each in found if each.is_dir()])
+    got = f"an empty folder: {_LEAVE_OUT}" if not found else f"other files: {_LEAVE_OUT}"
+    if folders:
+        remedy = "if they are cameras, --videos '{episode}/{camera}/*.png' names their pictures"
+        got = f"the folders {', '.join(folders[:3])}: {remedy}; or {_LEAVE_OUT}"
+    require(folder, bool(names), "PNG or JPEG files", got)
+    return [folder / name for name in in_order_of_numbers(folder, names)]
