@@ -15,7 +15,8 @@ from pyarrow import parquet
 
 from labelling import LEROBOT, WRIST, BrightnessScorer, Notes, change_column, tasks_of
 from rfm_client import ProgressResult, ProgressSample, Trajectory, UInt8Array
-from rfm_labels import CheckpointFacts, LabelOptions, label, open_dataset, read_episode_labels
+from rfm_labels import CheckpointFacts, DatasetError, LabelOptions, label, open_dataset, read_episode_labels
+from rfm_labels.advantage import recap_advantages
 
 CUTS = (0, 20, 30)  # first frames of the stretches of episode 0
 TASKS = (0, 4, 0)  # and numbers
@@ -130,3 +131,20 @@ def test_frames_before_a_change_of_tasks_keep_their_weight_in_behaviour_cloning(
     shown = read_episode_labels(report.files[0], 0)
     assert shown is not None
     np.testing.assert_array_equal(shown.fused.progress, own)
+
+
+def test_advantages_follow_recap_within_each_stretch_of_frames(root: Path, output: Path) -> None:
+    # By hand: 4 steps in the task's longest episode, horizon 2. A(0) = 0.5 - 0.1 - 2/4, ..., A(2) = 0.3 - 0.5 - 1/4.
+    progress = np.array([0.1, 0.2, 0.5, 0.3], np.float32)
+    np.testing.assert_allclose(recap_advantages(progress, 2, 4), [-0.1, -0.4, -0.45, 0.0], atol=1e-7)
+
+    chosen = options(output, mode="whole", frames=None, formats=("progress", "signals"), advantage=5)
+    report = label(open_dataset(root), Rising(max_frames=None), chosen)
+    table, signals = map(parquet.read_table, report.files)
+    advantages, length, horizon = table["advantage"].to_numpy(), 20, 5
+    left = np.minimum(horizon, length - 1 - np.arange(length))  # steps, fewer at the end of the first stretch
+    steps = 58 - 30 - 1  # in the third stretch, the longest of the first task
+    np.testing.assert_allclose(advantages[:length], left * (0.8 / (length - 1) - 1 / steps), atol=1e-6)
+    np.testing.assert_array_equal(signals["reward.rfm.advantage"].to_numpy(), advantages)
+    with pytest.raises(DatasetError, match=r"advantage\.frames: 5 there, 7 now"):
+        label(open_dataset(root), Rising(max_frames=None), replace(chosen, advantage=7))

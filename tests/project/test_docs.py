@@ -139,7 +139,7 @@ def test_every_example_runs(demo_server: Endpoints, folder: Path, code: str) -> 
     for source, name in re.findall(r"(my_dataset/|demos\.)(\w+)_progress\.parquet", code):
         dataset = open_dataset("demos.hdf5" if source == "demos." else "my_dataset")
         with RewardClient(demo_server.grpc_url) as client:
-            label(dataset, ClientScorer(client), LabelOptions(name=name, frames=4))
+            label(dataset, ClientScorer(client), LabelOptions(name=name, frames=4, advantage=5))
     shown: dict[str, Any] = names()
     exec(compile(code, "README", "exec"), shown)
     if "envs" in shown:

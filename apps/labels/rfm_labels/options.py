@@ -122,6 +122,12 @@ class LabelOptions(Settings):
         "How progress is made of remaining seconds, for a model without progress: "
         "remaining_over_first: 1 - the seconds / those of the episode's first frame.",
     )
+    advantage: int | None = setting(
+        None,
+        "Also write each frame's advantage over N frames, by RECAP's rule: the progress gained, less N / the steps of "
+        "the task's longest episode.",
+        least=1,
+    )
     mode: Mode = setting("prefix", "prefix: frame t is scored on the frames up to t. whole: all frames together.")
     resize: bool = setting(False, "Downscale frames to the model's input size before sending.")
     episodes: Sequence[int] | None = setting(

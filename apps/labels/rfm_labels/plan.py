@@ -23,6 +23,7 @@ from rfm_client.frames import (
     resize_frames,
 )
 from rfm_client.options import InvalidValueError, first_names
+from rfm_labels.advantage import RECAP
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.datasets.faults import FaultsError, listed, require
 from rfm_labels.datasets.stored_files import digest_of
@@ -226,11 +227,13 @@ class Plan:
     """The recipe, and the episodes to label, in frame order.
 
     dataset: kind, source and revision, for the provenance
+    horizon: frames over which advantages are taken; None: no advantages
     """
 
     items: Sequence[Item]
     recipe: Recipe
     dataset: Mapping[str, Any]
+    horizon: int | None = None
 
     @property
     def num_frames(self) -> int:
@@ -246,7 +249,8 @@ class Plan:
         digest = digest_of(item.digest.encode() for item in self.items)
         version = importlib.metadata.version("rfm-client")
         dataset = {**self.dataset, "digest": digest}
-        return {"writer": f"rfm-client {version}", "dataset": dataset, **self.recipe.document()}
+        advantage = {} if self.horizon is None else {"advantage": {"rule": RECAP, "frames": self.horizon}}
+        return {"writer": f"rfm-client {version}", "dataset": dataset, **self.recipe.document(), **advantage}
 
 
 def chosen_cameras(
@@ -368,7 +372,7 @@ def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: 
     for line in (*recipe.explanation(options), *left_out, *dataset.notes, *turned, *swapped, *tasks):
         watch.note(line)
     with all_faults(dataset, options):
-        return make_plan(dataset, recipe, episodes)
+        return replace(make_plan(dataset, recipe, episodes), horizon=options.advantage)
 
 
 def _task_lines(dataset: Dataset, episodes: Sequence[DatasetEpisode]) -> list[str]:

@@ -5,9 +5,10 @@ A part is a Parquet file in a folder or at an fsspec URL. Writes are atomic. The
 everything that decides the labels, so any run may reuse the part.
 
 ``<name>_progress.parquet``: the format that LeRobot's reward-aligned behaviour cloning and the Hub's visualizer read.
-Columns: int64 ``index``, ``episode_index``, ``frame_index``, then float32 ``progress_sparse``, ``success``, and one set
-per camera. If an episode has several tasks, ``progress`` restarts with each task, and ``progress_sparse`` adds up the
-gains. If the model skips frames, ``progress`` is NaN there, and ``progress_sparse`` is interpolated.
+Columns: int64 ``index``, ``episode_index``, ``frame_index``, then float32 ``progress_sparse``, ``success``, one set per
+camera, and on request ``advantage``. If an episode has several tasks, ``progress`` restarts with each task, and
+``progress_sparse`` adds up the gains. If the model skips frames, ``progress`` is NaN there, and ``progress_sparse`` is
+interpolated.
 
 ``reward_signals/<name>.parquet``: LeRobot's frame signals (schema version 1), as its open pull requests propose them.
 Columns: the same int64 columns, then float32 ``reward.<name>.progress``, ``reward.<name>.success_probability``, and one
@@ -27,6 +28,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from rfm_client import Float32Array
+from rfm_labels.advantage import most_steps, recap_advantages
 from rfm_labels.datasets.faults import DatasetError, require
 from rfm_labels.metadata import (
     PROGRESS,
@@ -48,8 +50,9 @@ SIGNALS_PROVENANCE_KEY = b"lerobot.reward_scoring.provenance"
 EPISODES_KEY = b"rfm.episodes"  # digest per episode: a later run compares them to see whether the labels still hold
 FILL_KEY = b"rfm.progress_sparse_fill"  # absent if the model skipped no frame
 SIGNAL_NAMES = {**{name: name for name in SCORES}, SUCCESS: "success_probability", REMAINING: "remaining_time_s"}
-_POTENTIAL, _IS_SCORED = "potential", "is_inference_frame"
+_POTENTIAL, _IS_SCORED, _ADVANTAGE = "potential", "is_inference_frame", "advantage"
 _DERIVED = {  # further signals and what they mean
+    _ADVANTAGE: "Progress gained over the horizon, less the time it took (RECAP)",
     _POTENTIAL: "Minus the remaining seconds",
     _IS_SCORED: "1 where the model scored the frame itself",
 }
@@ -199,9 +202,10 @@ def _progress_form(plan: Plan, columns: Sequence[str]) -> Form:
     named = {name: name for name in columns}
     if skipping_in(columns):
         metadata[FILL_KEY] = b"linear"
+    advantage = {} if plan.horizon is None else {_ADVANTAGE: _ADVANTAGE}
     if skipping_in(columns) or _has_several_tasks(plan):
-        return {_TOTAL: "progress_sparse", **named}, metadata
-    return {**named, PROGRESS: "progress_sparse"}, metadata
+        return {_TOTAL: "progress_sparse", **named, **advantage}, metadata
+    return {**named, PROGRESS: "progress_sparse", **advantage}, metadata
 
 
 def _with_totals(labels: Any, plan: Plan) -> Any:
@@ -222,6 +226,8 @@ def _with_totals(labels: Any, plan: Plan) -> Any:
         derived[_IS_SCORED] = np.isfinite(labels[skipping].to_numpy()).astype(np.float32)
     for name, values in derived.items():
         labels = labels.append_column(name, pa.array(values))
+    if plan.horizon is not None:
+        labels = labels.append_column(_ADVANTAGE, pa.array(_advantages(labels[PROGRESS].to_numpy(), plan)))
     if not (skipping or _has_several_tasks(plan)):
         return labels
     progress = labels[PROGRESS].to_numpy()
@@ -236,6 +242,20 @@ def _with_totals(labels: Any, plan: Plan) -> Any:
             total[begin:end] = _filled(total[begin:end])
         begin = end
     return labels.append_column(_TOTAL, pa.array(total))
+
+
+def _advantages(progress: Float32Array, plan: Plan) -> Float32Array:
+    """Return the advantages of all frames, float32 [T], each within its stretch of frames with one task."""
+    assert plan.horizon is not None
+    steps = most_steps(item.episode for item in plan.items)
+    stretches = [stretch for item in plan.items for stretch in item.episode.stretches]
+    starts = np.cumsum([0, *(num_frames for _, num_frames in stretches)])
+    return np.concatenate(
+        [
+            recap_advantages(_filled(progress[start : start + num_frames]), plan.horizon, steps[task])
+            for start, (task, num_frames) in zip(starts, stretches, strict=False)
+        ]
+    )
 
 
 def _filled(progress: Float32Array) -> Float32Array:
@@ -262,6 +282,8 @@ def _signals_form(plan: Plan, columns: Sequence[str], name: str) -> Form:
     if REMAINING in signals:
         signals[_POTENTIAL] = f"reward.{name}.{_POTENTIAL}"
     skipping = skipping_in(signals)
+    if plan.horizon is not None:
+        signals[_ADVANTAGE] = f"reward.{name}.{_ADVANTAGE}"
     if REMAINING in signals or skipping is not None:
         signals[_IS_SCORED] = f"reward.{name}.{_IS_SCORED}"
     metadata = {
