@@ -31,6 +31,7 @@ from rfm_labels.ray_engine import Connect, label_with_ray
 from rfm_labels.scorer import ClientScorer, Scorer
 from rfm_labels.summary import summarise
 
+ASK_BYTES = 10e9  # downloads above this need a confirmation
 SPEED_OVER_S = 600.0  # an episode may take minutes
 Printer: TypeAlias = Callable[[str], None]
 _CAMERA_OPTIONS = ("orient", "channels")  # options with a value per camera
@@ -38,17 +39,20 @@ DatasetArgument = Annotated[
     str,
     typer.Argument(
         metavar="DATASET",
-        help="LeRobot folder or Hub id org/name@revision; HDF5 file, or a folder of them; RLDS folder; folder of "
-        "videos, of folders of pictures, or of .npy and .npz files, with tasks.csv; any folder with --videos or "
-        "--reader.",
+        help="LeRobot folder, or Hub id org/name@revision or its address; HDF5 file, or a folder of them; RLDS folder; "
+        "folder of videos, of folders of pictures, or of .npy and .npz files, with tasks.csv; any folder with --videos "
+        "or --reader.",
     ),
 ]
 
 
 class ProgressBar(Watch):
-    """Writes notes to standard error and, on a terminal, shows a bar with speed and remaining time."""
+    """Writes notes to standard error and, on a terminal, shows a bar with speed and remaining time.
 
-    def __init__(self, say: Printer) -> None:
+    accepts: True: download any number of bytes; False: ask in a terminal, else refuse, above ASK_BYTES
+    """
+
+    def __init__(self, say: Printer, *, accepts: bool = False) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn, TimeRemainingColumn
         from rich.text import Text
@@ -59,7 +63,7 @@ class ProgressBar(Watch):
 
         console = Console(stderr=True)
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Rate(""), TimeRemainingColumn())
-        self._say = say
+        self._say, self._accepts = say, accepts
         self._bar = Progress(
             *columns,
             console=console,
@@ -79,6 +83,19 @@ class ProgressBar(Watch):
     def note(self, text: str) -> None:
         """Write the text on a line."""
         self._say(f"note: {text}")
+
+    def downloading(self, num_files: int, num_bytes: int) -> None:
+        """Write how much is downloaded. Raises ConfigError, or typer.Abort after a "no", for a large download."""
+        size = f"{num_bytes / 1e9:.2f} GB in {num_files} files"
+        self.note(f"downloading {size}, all that the chosen episodes and cameras need")
+        if num_bytes <= ASK_BYTES or self._accepts:
+            return
+        if not sys.stdin.isatty():
+            remedy = "choose fewer episodes (--episodes, --limit) or cameras (--cameras)"
+            raise ConfigError.at("yes", f"--yes for more than {ASK_BYTES / 1e9:g} GB", f"none for {size}", remedy)
+        self._bar.stop()
+        typer.confirm(f"Download {size}?", abort=True)
+        self._bar.start()
 
     def checking(self, num_episodes: int) -> None:
         """Start counting checked episodes."""
@@ -185,6 +202,7 @@ class RunOptions(Settings):
     engine: Literal["threads", "ray"] = setting("threads", "threads: in this process. ray: by actors of a Ray cluster.")
     dry_run: bool = setting(False, "Check everything, count, write nothing.")
     report: bool = setting(False, "Only show the summary of labels that are there.")
+    yes: bool = setting(False, f"Download more than {ASK_BYTES / 1e9:g} GB from the Hub without a question.")
 
 
 @with_options
@@ -283,7 +301,7 @@ class LabelCommand:
         return checked
 
     def _label(self) -> Report:
-        watch = ProgressBar(self.say)
+        watch = ProgressBar(self.say, accepts=self.options.yes)
         try:
             with watch:
                 if self.options.engine == "ray":
@@ -300,7 +318,7 @@ class LabelCommand:
     def _try(self) -> None:
         """Check everything, write nothing."""
         dataset = self._dataset()
-        with self.connect() as scorer, ProgressBar(self.say) as watch:
+        with self.connect() as scorer, ProgressBar(self.say, accepts=self.options.yes) as watch:
             plan = planned(dataset, scorer, Outputs.of(dataset, self.labels), watch)
         tasks = sorted({task for item in plan.items for task, _ in item.episode.stretches})
         cameras = plan.recipe.decoded_cameras

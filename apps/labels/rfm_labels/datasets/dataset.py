@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -285,6 +285,14 @@ class Dataset(ABC):
         named = {camera: word for camera in cameras if (word := word_of_no_colours(camera))}
         return named | {camera: "depth" for camera in cameras if camera in self.depth_cameras}
 
+    def download(  # noqa: B027  a local dataset has all
+        self, numbers: Sequence[int], cameras: Sequence[str], accept: Callable[[int, int], None] | None = None
+    ) -> None:
+        """Download what these episodes and cameras need and is not here yet. Raises DatasetError.
+
+        accept: called before a download with its files and bytes; may raise an error
+        """
+
     @abstractmethod
     def decoder(self, camera: str) -> str | None:
         """Return the library that decodes the camera's frames, with its version; None: they are stored as pixels."""
@@ -362,6 +370,7 @@ def iter_episodes(
     Only one episode's frames are in memory at a time.
     """
     names = dataset.chosen_cameras(cameras or ())
+    dataset.download(dataset.numbers, names)
     for episode in dataset.episodes:
         for camera in names:
             dataset.check(episode, camera)

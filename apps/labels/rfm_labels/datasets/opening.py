@@ -15,12 +15,13 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any
 
-from rfm_client.frames import ARRAY_SUFFIXES, ChannelOrder, Orientation, cached_snapshot
+from rfm_client.frames import ARRAY_SUFFIXES, ChannelOrder, Orientation
 from rfm_client.options import first_names
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER, AskedCorrections, Dataset, SeveralTasks, TaskOverride
 from rfm_labels.datasets.episodes import Episode, EpisodeDataset, Frames
 from rfm_labels.datasets.faults import DatasetError, FaultsError, require, shortened
 from rfm_labels.datasets.hdf5 import SUFFIXES, Hdf5Dataset, is_hdf5
+from rfm_labels.datasets.hub import HubFiles
 from rfm_labels.datasets.lerobot import LeRobotDataset
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
 from rfm_labels.datasets.lerobot_meta import INFO_FILE, Info
@@ -34,7 +35,7 @@ from rfm_labels.datasets.rlds_files import FEATURES_FILE
 TABLE = "tasks.csv"
 _NAMES = ("video", "episode")  # column names for the path
 _DELIMITERS = ",;\t"
-_HUB_ID = re.compile(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")
+_HUB_ID = re.compile(r"(?:hf://datasets/|https?://[^/]+/datasets/)?([\w.-]+/[\w.-]+)(?:(?:@|/tree/)([\w./-]+?))?/?")
 _LAYOUTS = (
     f"a LeRobot dataset ({INFO_FILE}), an RLDS dataset ({FEATURES_FILE}), an HDF5 file ({', '.join(SUFFIXES)}), a "
     f"folder of videos, of folders of pictures or of {' and '.join(ARRAY_SUFFIXES)} files with {TABLE}, "
@@ -122,7 +123,9 @@ def open_dataset(
     channels: ChannelOrder | Mapping[str, ChannelOrder] | None = None,
     tolerance_s: float = TOLERANCE_S,
 ) -> Dataset:
-    """Open the dataset at a path, or download the Hub id ``org/name[@revision]``. An existing path wins.
+    """Open the dataset at a path, or on the Hub: ``org/name[@revision]``, or its address. An existing path wins.
+
+    Of a dataset on the Hub, only the metadata are downloaded. ``Dataset.download`` fetches what episodes need.
 
     reader: function that yields the episodes of the folder, each an ``Episode``, or its name, ``FILE.py:FUNCTION``
     videos: pattern for videos, pictures or arrays below the folder, such as ``{episode}/videos/{camera}.mp4`` or
@@ -168,16 +171,10 @@ def open_dataset(
 
 
 def _from_hub(name: str, revision: str | None, **opening: Any) -> LeRobotDataset:
-    try:
-        folder = cached_snapshot(name, "dataset", revision)
-    except ImportError as error:
-        raise ImportError("datasets of the Hub need huggingface-hub: pip install ./client ./apps/labels") from error
-    except OSError as error:
-        raise DatasetError.at(name, "a local dataset or one of the Hub", f"none: {error}") from error
-    if not (folder / INFO_FILE).is_file():
-        raise DatasetError.at(name, f"a LeRobot dataset's {INFO_FILE}", _unread(folder) or "none")
-    commit = folder.name  # a snapshot's folder is named after the commit
-    return LeRobotDataset(folder, source=name, revision=commit, **opening)
+    hub = HubFiles(name, revision)
+    if not (hub.folder / INFO_FILE).is_file():
+        raise DatasetError.at(name, f"a LeRobot dataset's {INFO_FILE}", _unread(hub.folder) or "none")
+    return LeRobotDataset(hub.folder, hub=hub, **opening)
 
 
 def open_to_show(source: str) -> LeRobotDataset | Hdf5Dataset | RldsDataset:
