@@ -6,16 +6,17 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias, get_args
 
 import typer
 
 from rfm_client import RewardError
-from rfm_client.command_line import ExitCode, ServerOptions, print_table, report, with_options
+from rfm_client.command_line import ExitCode, JsonOutput, ServerOptions, print_table, report, with_options
 from rfm_client.frames import ChannelOrder, Orientation
 from rfm_client.options import ConfigError, Settings, setting
+from rfm_labels.audit import audit
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, SeveralTasks, parsed_by_camera
 from rfm_labels.datasets.faults import FaultsError, UnusedTaskError, listed, require
 from rfm_labels.datasets.hdf5 import label_prefix
@@ -64,6 +65,7 @@ class ProgressBar(Watch):
         console = Console(stderr=True)
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Rate(""), TimeRemainingColumn())
         self._say, self._accepts = say, accepts
+        self.notes: list[str] = []
         self._bar = Progress(
             *columns,
             console=console,
@@ -82,6 +84,7 @@ class ProgressBar(Watch):
 
     def note(self, text: str) -> None:
         """Write the text on a line."""
+        self.notes.append(text)
         self._say(f"note: {text}")
 
     def downloading(self, num_files: int, num_bytes: int) -> None:
@@ -194,13 +197,16 @@ class EpisodeTexts(Settings):
 
 
 @dataclass(frozen=True)
-class RunOptions(Settings):
+class RunOptions(JsonOutput):
     """Engine, trial run and report of a labelling command."""
 
     TITLE: ClassVar[str] = "Run"
 
     engine: Literal["threads", "ray"] = setting("threads", "threads: in this process. ray: by actors of a Ray cluster.")
-    dry_run: bool = setting(False, "Check everything, count, write nothing.")
+    dry_run: bool = setting(
+        False, "Check everything, count, list doubts (blank or frozen cameras, stale files), write nothing."
+    )
+    json: str | None = setting(None, "With --dry-run: write it as JSON to FILE; - prints it.", metavar="FILE|-")
     report: bool = setting(False, "Only show the summary of labels that are there.")
     yes: bool = setting(False, f"Download more than {ASK_BYTES / 1e9:g} GB from the Hub without a question.")
 
@@ -316,20 +322,31 @@ class LabelCommand:
             raise
 
     def _try(self) -> None:
-        """Check everything, write nothing."""
+        """Check everything, list doubts, write no labels."""
+        self.options.begin()
         dataset = self._dataset()
         with self.connect() as scorer, ProgressBar(self.say, accepts=self.options.yes) as watch:
             plan = planned(dataset, scorer, Outputs.of(dataset, self.labels), watch)
+            cameras = plan.recipe.decoded_cameras
+            doubts = audit(dataset, [item.episode for item in plan.items], cameras, watch)
         tasks = sorted({task for item in plan.items for task, _ in item.episode.stretches})
-        cameras = plan.recipe.decoded_cameras
+        source = dataset.source + (f"@{dataset.revision}" if dataset.revision else "")
+        document = {"dataset": source, "kind": dataset.kind, "episodes": len(plan.items), "frames": plan.num_frames}
+        document |= {"cameras": list(cameras), "tasks": tasks, "notes": watch.notes}
+        self.options.write_json(document | {"doubts": [asdict(doubt) for doubt in doubts]})
+        if not self.options.prints_tables:
+            return
         decoded = f"of {len(cameras)} cameras: {plan.num_frames * len(cameras)} to be decoded"
         rows = [
-            ("dataset", f"{dataset.kind}: {dataset.source}" + (f"@{dataset.revision}" if dataset.revision else "")),
+            ("dataset", f"{dataset.kind}: {source}"),
             ("episodes", str(len(plan.items))),
             ("frames", f"{plan.num_frames}, {decoded}"),
             (f"tasks: {len(tasks)}", "; ".join(tasks[:5]) + (" ..." if len(tasks) > 5 else "")),
+            ("doubts", "none" if not doubts else str(len(doubts))),
         ]
         _print(rows)
+        for doubt in doubts:
+            typer.echo(f"doubt: {doubt}")
 
     def _tell(self, report: Report) -> ExitCode:
         if report.failures:

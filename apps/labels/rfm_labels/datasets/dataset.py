@@ -293,6 +293,10 @@ class Dataset(ABC):
         accept: called before a download with its files and bytes; may raise an error
         """
 
+    def unused_files(self) -> Sequence[Path]:
+        """Return files with rows or frames that no episode uses, relative to ``root``; empty for most layouts."""
+        return []
+
     @abstractmethod
     def decoder(self, camera: str) -> str | None:
         """Return the library that decodes the camera's frames, with its version; None: they are stored as pixels."""

@@ -134,6 +134,13 @@ class LeRobotDataset(Dataset):
             accept(len(sizes), sum(sizes.values()))
         self._hub.download(self.root / name for name in sizes)
 
+    def unused_files(self) -> Sequence[Path]:
+        entries = [each for each in self._entries.values() if isinstance(each, Entry)]
+        used = {entry.data_file for entry in entries}
+        used |= {place[0] for entry in entries for place in entry.videos.values() if isinstance(place, tuple)}
+        found = {file for pattern in ("data/**/*.parquet", "videos/**/*.mp4") for file in self.root.glob(pattern)}
+        return sorted(file.relative_to(self.root) for file in found - used)
+
     def _here(self, file: Path) -> Path:
         """Return the file, after its download if it is missing and the dataset is the Hub's. Raises DatasetError."""
         if self._hub is not None:
