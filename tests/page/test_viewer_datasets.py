@@ -318,10 +318,12 @@ def test_a_dataset_that_breaks_says_why(
 
 
 def test_a_frame_of_another_size_is_refused_not_stretched(tmp_path: Path) -> None:
-    frames = [writers.jpeg(frame) for frame in (*writers.video(3), writers.video(1)[0, :40])]
-    with serving(writers.write_aloha(tmp_path / "demos.hdf5", {"high": frames})) as get:
+    (tmp_path / "demos" / "0").mkdir(parents=True)
+    for t, frame in enumerate((*writers.video(3), writers.video(1)[0, :40])):
+        Image.fromarray(frame).save(tmp_path / "demos" / "0" / f"{t}.png")
+    with serving(tmp_path / "demos") as get:
         told = failure(get("/0/episodes/0/videos/0"), 500)
-    assert "high: frame 3: expected a frame of 48 x 64 pixels, as the first, got 40 x 64 pixels" in told
+    assert "0: frames: frame 3: expected a frame of 48 x 64 pixels, as the first, got 40 x 64 pixels" in told
 
 
 def test_labels_that_come_or_change_are_shown_at_once(tmp_path: Path) -> None:

@@ -135,8 +135,8 @@ def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool | 
     """
     if is_reader(source):
         require("outcome", dataset is not None, "the folder of the recordings with a reader", "none")
-        episodes = read_episodes(source, dataset or Path())
-        return {number: None if each.success is None else bool(each.success) for number, each in enumerate(episodes)}
+        outcomes = (each.success for each in read_episodes(source, dataset or Path()))
+        return {number: None if outcome is None else bool(outcome) for number, outcome in enumerate(outcomes)}
     if Path(source).suffix.lower() == ".csv":
         return _of_csv(Path(source))
     if dataset is None or not (dataset / "meta").is_dir():

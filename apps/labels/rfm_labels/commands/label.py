@@ -39,8 +39,7 @@ DatasetArgument = Annotated[
     typer.Argument(
         metavar="DATASET",
         help="LeRobot folder or Hub id org/name@revision; HDF5 file, or a folder of them; RLDS folder; folder of "
-        "videos, of folders of pictures, or of .npy and .npz files, with tasks.csv; any folder with --videos or "
-        "--reader.",
+        "videos or of folders of pictures, with tasks.csv; any folder with --videos or --reader.",
     ),
 ]
 

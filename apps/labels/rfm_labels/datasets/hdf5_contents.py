@@ -62,22 +62,15 @@ def filter_keys(opened: Any) -> Mapping[str, Sequence[int]]:
     """Return the demonstration numbers in each ``mask`` dataset with names of demonstrations."""
     found: dict[str, Sequence[int]] = {}
     for key, stored in members_of(opened.get("mask")).items():
-        texts = texts_in(stored)
-        names = [re.fullmatch(r"demo_(0|[1-9]\d*)", text) for text in texts or ()]
-        if texts is not None and None not in names:
+        try:
+            values = np.ravel(stored[()]).tolist()
+        except (OSError, RuntimeError, TypeError, ValueError):
+            continue
+        texts = [value.decode(errors="replace") if isinstance(value, bytes) else str(value) for value in values]
+        names = [re.fullmatch(r"demo_(0|[1-9]\d*)", text) for text in texts]
+        if None not in names:
             found[key] = sorted({int(name[1]) for name in names if name})
     return found
-
-
-def texts_in(stored: Any) -> list[str] | None:
-    """Read the texts in a dataset; None if it holds something else or cannot be read."""
-    if getattr(stored, "shape", None) is None:
-        return None
-    try:
-        values = np.ravel(stored[()]).tolist()
-    except (OSError, RuntimeError, TypeError, ValueError):
-        return None
-    return [value.decode(errors="replace") if isinstance(value, bytes) else str(value) for value in values]
 
 
 def is_of_libero(attributes: Mapping[str, Any]) -> bool:

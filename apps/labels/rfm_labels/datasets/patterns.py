@@ -97,7 +97,7 @@ def suggested_pattern(root: Path, example: str) -> str:
     *columns, files = zip(*(name.parts for name in names), strict=True)
     if suffix.lower() in PICTURE_SUFFIXES:
         beside = Path(example).parent
-        name = picture_pattern(each.name for each in names if each.parent == beside)
+        name = picture_pattern([each.name for each in names if each.parent == beside])
     else:
         name = _part([Path(each).stem for each in files], "{camera}") if len(names) > 1 else "{episode}"
         name += suffix

@@ -51,9 +51,7 @@ def check_reader(reader: str | Reader, folder: str | Path, num_decoded: int = 3)
     """
     first, second = (open_read(reader, Path(folder), TaskOverride(is_needed=False)) for _ in range(2))
     where = f"reader: {_name_of(reader)}"
-    both = [
-        [(each.name, each.task, sorted(each.frames)) for each in dataset.given.values()] for dataset in (first, second)
-    ]
+    both = [[(each.name, each.task, sorted(each.frames)) for each in dataset.given] for dataset in (first, second)]
     for number, (one, other) in enumerate(zip(*both, strict=False)):
         require(f"{where}: episode {number}", one == other, f"the same each time: {one}", other)
     counts = [len(each) for each in both]
@@ -62,7 +60,7 @@ def check_reader(reader: str | Reader, folder: str | Path, num_decoded: int = 3)
     lines = []
     for episode in first.episodes:
         cameras = []
-        for camera, stored in first.stored[episode.index].items():
+        for camera, stored in first.recorded[episode.index].cameras.items():
             first.check(episode, camera)
             size = ""
             if episode.index in decoded:
@@ -92,7 +90,7 @@ def reader_named(name: str) -> Reader:
     module = sys.modules[spec.name] = module_from_spec(spec)  # dataclasses look their module up
     with faults_of_reader(f"reader: {file}"):
         spec.loader.exec_module(module)
-    reader = getattr(module, function, None)
+    reader: Reader = getattr(module, function, None)  # type: ignore[assignment]  # checked below
     known = [
         each
         for each, value in vars(module).items()
