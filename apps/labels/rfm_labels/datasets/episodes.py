@@ -88,14 +88,9 @@ def _check_form(where: str, frames: Any) -> None:
         fault = colours_fault(frames) or ("no frames" if not len(frames) else "")
         require(where, not fault, "uint8 [T, H, W, 3]", fault)
         return
-    is_list = isinstance(frames, Sequence) and not isinstance(frames, str | bytes)
-    are_paths = is_list and bool(frames) and all(isinstance(each, str | Path) for each in frames)
-    got = type(frames).__name__
-    if is_list:
-        got += f" of {type(frames[0]).__name__}: np.stack them" if frames else ": no frames"
-    elif isinstance(frames, Iterator):
-        got += f": {_BY_FUNCTION}"
-    require(where, isinstance(frames, str | Path) or are_paths or callable(frames), _FORMS, got)
+    are_paths = isinstance(frames, Sequence) and bool(frames) and all(isinstance(each, str | Path) for each in frames)
+    got = f"{type(frames).__name__}: np.stack a list of arrays, and give a function itself, not what it returns"
+    require(where, are_paths or isinstance(frames, Path) or callable(frames), _FORMS, got)
 
 
 class _VideoFile(Stored):
@@ -219,14 +214,13 @@ class EpisodeDataset(RecordedDataset):
         notes: Sequence[str] = (),
     ) -> None:
         self.root, self.source, self.kind, self.given_task, self.notes = root, root.resolve().name, kind, task, notes
-        self.given = list[Episode]()
         opened, names, recorded = lru_cache(_FILES_AT_A_TIME)(Video), set[str](), dict[int, Recorded]()
-        num_bytes, functions = 0, dict[object, str]()
+        num_bytes, functions, rates = 0, dict[object, str](), list[float | None]()
         for number, episode in enumerate(episodes):
             place, cameras = f"{where}: {episode.name}", dict[str, Stored]()
             require(f"{where}: name", episode.name not in names, "each once", f"{episode.name!r} again")
             names.add(episode.name)
-            self.given.append(episode)
+            rates.append(episode.fps)
             for camera, frames in episode.frames.items():
                 num_bytes += 0 if isinstance(frames, np.memmap) else getattr(frames, "nbytes", 0)
                 expected = f"arrays of at most {MAX_ARRAY_BYTES / 2**30:g} GiB in all episodes"
@@ -239,4 +233,5 @@ class EpisodeDataset(RecordedDataset):
             recorded[number] = Recorded(episode.name, place, episode.task, place, cameras, missing)
         require(where, bool(recorded), "at least one episode", "none")
         self.corrections = corrections.of_cameras(self.set_recorded(recorded))
-        self.fps = next((each.fps for each in self.given if each.fps), None)
+        self.numbers = range(len(recorded))  # finds a number at once
+        self.fps = next(filter(None, rates), None)

@@ -70,25 +70,17 @@ class _Pixels(Stored):
     def identity(self) -> str:
         return digest_of(frame.tobytes() for frame in self.frames())
 
-    def check(self) -> None:
-        with opened_hdf5(self._file) as opened:
-            self._video(opened)
-
     def frames(self) -> Iterator[UInt8Array]:
         with opened_hdf5(self._file) as opened:
-            video = self._video(opened)
+            video, length = opened.get(self._path), self._counts[0]
+            is_video = video is not None and not fault_of(video) and len(video) == length
+            got = "none" if video is None else form_of(video)
+            require(f"{self._file}: {self._path}", is_video, f"uint8 [{length}, H, W, 3]", got)
             for start in range(self._skipped, len(video), _FRAMES_AT_A_TIME):
                 try:
                     yield from video[start : start + _FRAMES_AT_A_TIME]
                 except OSError as error:
                     raise DatasetError.at(f"{self._file}: {self._path}", "readable frames", error) from error
-
-    def _video(self, opened: Any) -> Any:
-        video, length = opened.get(self._path), self._counts[0]
-        is_video = video is not None and not fault_of(video) and len(video) == length
-        got = "none" if video is None else form_of(video)
-        require(f"{self._file}: {self._path}", is_video, f"uint8 [{length}, H, W, 3]", got)
-        return video
 
 
 def is_hdf5(path: Path) -> bool:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -144,15 +144,12 @@ def demonstrations(file: Path, opened: Any) -> dict[int, tuple[str, Any]]:
 def observations(group: Any, folder: str) -> dict[str, Any]:
     """Return a demonstration's observations by name; None for one that cannot be opened or that NumPy does not know."""
     found = members_of(group.get(folder) if hasattr(group, "keys") else None)
-    return {name: value if _is_known(value) else None for name, value in found.items()}
-
-
-def _is_known(value: Any) -> bool:
-    """True for a group, or an array with numbers or texts that NumPy knows."""
-    try:
-        return hasattr(value, "keys") or (getattr(value, "shape", None) is not None and bool(value.dtype.kind))
-    except (TypeError, OSError, RuntimeError):
-        return False
+    known: dict[str, Any] = dict.fromkeys(found)
+    for name, value in found.items():
+        with suppress(TypeError, OSError, RuntimeError):
+            if hasattr(value, "keys") or (getattr(value, "shape", None) is not None and value.dtype.kind):
+                known[name] = value
+    return known
 
 
 def task_of(opened: Any, demo: Any) -> Any:

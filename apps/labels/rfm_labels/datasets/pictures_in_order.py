@@ -53,7 +53,7 @@ def in_order_of_numbers(folder: Path, files: Sequence[str]) -> list[str]:
     if len({name.words for name in names}) > 1:
         raise _several_kinds(folder, files)
     for before, name in itertools.pairwise(names):
-        got = f"{before.file} and {name.file}: {_LEAVE_OUT}"
+        got = f"{before.file} and {name.file}: leave the episode out (--episodes)"
         require(folder, before.numbers != name.numbers, "each number once", got)
     if any(_counts_cameras(names, place) for place in range(len(names[0].numbers) if names else 0)):
         raise _several_kinds(folder, files)
