@@ -11,6 +11,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from paths import ROOT
 from rfm_client.frames import read_video
 from rfm_client.options import ConfigError
 from rfm_labels import LabelOptions, label, open_dataset, read_episode_labels
-from rfm_labels.datasets import LeRobotDataset
+from rfm_labels.datasets import LeRobotDataset, open_to_show
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew, hdf5
 
 V21, V30 = range(2)  # datasets with labels; one without follows
@@ -51,7 +52,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 @contextmanager
-def serving(*roots: Path, **settings: Any) -> Iterator[Get]:
+def serving(*roots: Path | str, **settings: Any) -> Iterator[Get]:
     """Run a gateway that shows the datasets in these folders. Yields a function that asks it."""
     with inside(dataset=tuple(map(str, roots)), **settings) as gateway:
         yield lambda path: gateway.get(f"/viewer/datasets{path}")
@@ -134,10 +135,33 @@ def with_pictures_in_tables(folder: Path) -> Path:
     return root
 
 
-@pytest.mark.parametrize("make", [rlds, with_pictures_in_tables, hdf5])
-def test_pictures_are_shown_as_a_video(tmp_path: Path, make: Callable[[Path], Path]) -> None:
+def by_pattern(folder: Path) -> str:
+    for number, place in product(range(2), ("left", "right")):
+        (folder / "recordings" / f"{number}" / place).mkdir(parents=True)
+        for t, frame in enumerate(writers.video(4, seed=number)):
+            Image.fromarray(frame).save(folder / "recordings" / f"{number}" / place / f"{t}.png")
+    return f"{{episode}}/{{camera}}/*.png={folder}/recordings"
+
+
+def by_reader(folder: Path) -> str:
+    for number in range(2):
+        np.save(folder / f"{number}.npy", writers.video(4, seed=number))
+    reader = """
+import numpy as np
+from rfm_labels import Episode
+
+def episodes(folder):
+    for file in sorted(folder.glob("*.npy")):
+        yield Episode(file.stem, {"front": np.load(file)}, fps=10)
+"""
+    (folder / "my_reader.py").write_text(reader)
+    return f"{folder}/my_reader.py:episodes={folder}"
+
+
+@pytest.mark.parametrize("make", [rlds, with_pictures_in_tables, hdf5, by_pattern, by_reader])
+def test_pictures_are_shown_as_a_video(tmp_path: Path, make: Callable[[Path], Path | str]) -> None:
     root = make(tmp_path)
-    dataset = open_dataset(root)
+    dataset = open_to_show(str(root))
     number, camera = dataset.numbers[1], len(dataset.cameras) - 1
     with serving(root) as get:
         table, curves = get("/0").json(), get(f"/0/episodes/{number}").json()

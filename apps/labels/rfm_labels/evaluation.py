@@ -135,8 +135,7 @@ def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool | 
     """
     if is_reader(source):
         require("outcome", dataset is not None, "the folder of the recordings with a reader", "none")
-        outcomes = (each.success for each in read_episodes(source, dataset or Path()))
-        return {number: None if outcome is None else bool(outcome) for number, outcome in enumerate(outcomes)}
+        return {number: each.success for number, each in enumerate(read_episodes(source, dataset or Path()))}
     if Path(source).suffix.lower() == ".csv":
         return _of_csv(Path(source))
     if dataset is None or not (dataset / "meta").is_dir():

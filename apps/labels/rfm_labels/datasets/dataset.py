@@ -162,11 +162,6 @@ class TaskOverride:
         is_read = self.column is None or not self.overrides
         require("task_column", is_read, "none with --override-task, which reads no tasks", self.column)
 
-    @property
-    def needs_table(self) -> bool:
-        """True if each episode needs a task of its own."""
-        return self.text is None and self.is_needed
-
     def of(self, where: object, own: object) -> str:
         """Choose between the episode's task, ``own``, and the caller's. Raises DatasetError without a task."""
         if self.text is not None and (self.overrides or is_blank(own)):

@@ -78,8 +78,8 @@ class Episode:
         require(f"{where}: task", self.task is None or isinstance(self.task, str), "a sentence", repr(self.task))
         is_rate = self.fps is None or (isinstance(self.fps, int | float) and 0 < self.fps < np.inf)
         require(f"{where}: fps", is_rate, "frames per second, above 0", repr(self.fps))
-        is_outcome = self.success is None or isinstance(self.success, bool | np.bool_)
-        require(f"{where}: success", is_outcome, "True, False or None", repr(self.success))
+        is_outcome = self.success is None or isinstance(self.success, bool)
+        require(f"{where}: success", is_outcome, "True, False or None (bool(...) of NumPy's)", repr(self.success))
 
 
 def _check_form(where: str, frames: Any) -> None:
@@ -105,9 +105,8 @@ class _VideoFile(Stored):
         video.check_is_one_episode()
         with faults_at(self._file):
             packets = video.packets
-        expected = f"{packets.count} frames with time stamps"
-        require(self._file, len(packets.times_s) == packets.count, expected, len(packets.times_s))
-        require(self._file, packets.count > 0, "frames", "none")
+        num_timed, expected = len(packets.times_s), f"{packets.count or 'some'} frames with time stamps"
+        require(self._file, num_timed == packets.count > 0, expected, num_timed)
         return packets.count
 
     def identity(self) -> str:
@@ -138,7 +137,8 @@ class _Pictures(Stored):
         return pictures_in(self._place) if isinstance(self._place, Path) else self._place
 
     def identity(self) -> str:
-        return digest_of(f"{file.name} {file_identity(file)}{turn_mark(file)}".encode() for file in self._files())
+        of_files = ((file.name, file_identity(file, what="picture") + turn_mark(file)) for file in self._files())
+        return digest_of(" ".join(each).encode() for each in of_files)
 
     def check(self) -> None:
         check_pictures(self._files())

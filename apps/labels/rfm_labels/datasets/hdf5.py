@@ -3,10 +3,8 @@
 
 The task is the demonstration's own (``ep_meta``), else LIBERO's sentence (``problem_info`` of ``data``), robomimic's
 (``env_args``), or the caller's. LIBERO stores pictures upside down: they are turned, unless the caller says otherwise.
-robomimic's filter keys (``mask/train``) name some demonstrations.
-
-IsaacLab-Arena keeps pictures in ``camera_obs``. The first shows the end of the demonstration before, and is left out,
-as by Arena's converter to LeRobot.
+robomimic's filter keys (``mask/train``) name some demonstrations. IsaacLab-Arena keeps pictures in ``camera_obs``. The
+first shows the end of the demonstration before, and is left out, as by Arena's converter to LeRobot.
 """
 
 from __future__ import annotations
@@ -99,11 +97,8 @@ class Hdf5Dataset(RecordedDataset):
     def __init__(
         self, file: Path, *, task: TaskOverride = TaskOverride(), corrections: AskedCorrections = AskedCorrections()
     ) -> None:
-        self.file = file
-        self.root = file.parent
+        self.file, self.root, self.source, self.given_task = file, file.parent, file.name, task
         self.label_prefix = label_prefix(file)
-        self.source = file.name
-        self.given_task = task
         with opened_hdf5(file) as opened:
             groups, attributes = demonstrations(file, opened), opened["data"].attrs
             is_arena = any(_ARENA in members_of(group) for _, group in groups.values())
@@ -126,9 +121,8 @@ class Hdf5Dataset(RecordedDataset):
         why = "is not a JSON object, so it states neither a task nor LIBERO"
         self.notes = [f"data: {name} {why}" for name in broken]
         self.notes += [] if is_upright else _notes(uncorrected, is_libero)
-        if is_arena:
-            why = "which shows the end of the episode before; frame 0 is the second"
-            self.notes += [f"layout: IsaacLab-Arena; left out: each first picture, {why}"]
+        why = "which shows the end of the episode before; frame 0 is the second"
+        self.notes += [f"layout: IsaacLab-Arena; left out: each first picture, {why}"] * is_arena
 
     def _recorded(self, name: str, group: Any, task: Any, task_place: str) -> Recorded:
         found = observations(group, self._folder)
@@ -154,12 +148,10 @@ class Hdf5Dataset(RecordedDataset):
 
 
 def _notes(uncorrected: Sequence[str], is_libero: bool) -> list[str]:
-    if is_libero and uncorrected:
+    if is_libero:
         why = "LIBERO stores its pictures upside down; --orient none leaves them"
-        return [f"orient: {', '.join(uncorrected)} {_LIBERO} ({why})"]
-    doubtful = [camera for camera in uncorrected if camera in _LIBERO_CAMERAS]
-    if not doubtful:
-        return []
+        return [f"orient: {', '.join(uncorrected)} {_LIBERO} ({why})"] if uncorrected else []
+    doubtful = ", ".join(camera for camera in uncorrected if camera in _LIBERO_CAMERAS)
     advice = f"look at a frame, and turn them with --orient {_LIBERO} if they are upside down"
     why = "as stored, but LIBERO, which names cameras so, stores them upside down"
-    return [f"orient: {', '.join(doubtful)} {why}: {advice}"]
+    return [f"orient: {doubtful} {why}: {advice}"] if doubtful else []

@@ -21,12 +21,6 @@ DOCUMENTS = ("problem_info", "env_args")  # attributes of ``data`` that hold a J
 _SENTENCES = ("language_instruction", "language", "lang")  # keys for the task in problem_info and env_args
 _DEFAULT_FPS = 20.0  # robosuite's
 _STARTS = (b"\xff\xd8\xff", b"\x89PNG")  # first bytes in JPEG and PNG files
-_READERS = {  # examples/readers of other layouts, by a name at the top of the file
-    "observations": "aloha.py, or robomind.py for observations/rgb_images",
-    "observation": "robotwin.py",
-    "traj_0": "maniskill.py",
-    "episode_0": "minari_pictures.py",
-}
 
 
 @contextmanager
@@ -133,10 +127,9 @@ def demonstrations(file: Path, opened: Any) -> dict[int, tuple[str, Any]]:
             twice = f"{found.get(number, ('', None))[0]} and {name}: rename one of them"
             require(f"{file}: data", number not in found, "one demonstration of each number", twice)
             found[number] = name, group
-    top = members_of(opened)
-    known = next((each for name, each in _READERS.items() if name in top), "a function of ten lines")
-    got = first_names(members) or f"none: the file holds {first_names(top) or 'nothing'}"
-    got += f"; a reader opens other layouts (--reader examples/readers/{known})" * ("data" not in top)
+    top = first_names(members_of(opened)) or "nothing"
+    others = "a reader opens other layouts, as those of ALOHA, ManiSkill, Minari and RoboTwin in examples/readers"
+    got = first_names(members) or f"none: the file holds {top}; {others}"
     require(f"{file}: data", bool(found), "demo_0, demo_1 and so on", got)
     return dict(sorted(found.items()))
 

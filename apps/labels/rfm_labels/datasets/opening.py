@@ -42,7 +42,6 @@ _LAYOUTS = (
 )
 _READER = "write a reader of ten lines (--reader; examples/readers)"
 _GIVE_TASK = '--task "SENTENCE"'
-_FILL = f"put a video or a folder of pictures for each episode in it, or {_READER}"
 _UNREAD = {  # remedies for layouts without a reader, by file name pattern
     r"meta_data": "a LeRobot dataset of v1: convert it to v2.0 with LeRobot 0.3",
     r".*\.tfrecord.*": f"TFRecord files without {FEATURES_FILE}, which TensorFlow Datasets 4.6 or later writes beside "
@@ -207,9 +206,8 @@ def hdf5_files(folder: str | Path) -> list[Path]:
     is_other = any((root / name).is_file() for name in (INFO_FILE, TABLE))
     if not root.is_dir() or is_other or set(_found(root)) - {"HDF5 files"}:
         return []
-    names = (str(file.relative_to(root)) for file in root.rglob("*") if file.suffix.lower() in SUFFIXES)
-    shown = [name for name in names if "/." not in f"/{name}" and not _OUR_FILES.fullmatch(name)]
-    return [root / name for name in in_natural_order(shown)]
+    names = [name for name in files_below(root) if name.lower().endswith(SUFFIXES) and not _OUR_FILES.fullmatch(name)]
+    return [root / name for name in in_natural_order(names)]
 
 
 def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -> Dataset:
@@ -218,7 +216,7 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
         raise DatasetError.at(path, _LAYOUTS, _unread(path) or "another file")
     table = path / TABLE if path.is_dir() else path
     if table.is_file():
-        root, tasks = table.parent, read_table_of_tasks(table, has_tasks=task.needs_table)
+        root, tasks = table.parent, read_table_of_tasks(table, has_tasks=task.text is None and task.is_needed)
         there = [name for name in tasks if (root / name).exists()] or list(tasks)
         pattern = next((name for name in tasks if "*" in name and not (root / name).exists()), "")
         got = f"{pattern}: name the pictures by --videos '{{episode}}/{Path(pattern).name}', and folders in the table"
@@ -227,7 +225,8 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
         kinds = {kind if kind in _KINDS else "videos": name for kind, name in found.items()}
         examples = " and ".join(f"{kind} ({name})" for kind, name in sorted(kinds.items()))
         require(table, len(kinds) == 1, "episodes of one kind", f"{examples}: write a table for each kind")
-        (kind,), notes = kinds, _unlisted(table, next(iter(kinds)), tasks)
+        (kind,) = kinds
+        notes = _notes(table, kind, _unlisted(table, kind, tasks))
     else:
         require(path, path.is_dir(), _LAYOUTS, "neither")
         (kind, names), root, table, notes = _listed(path), path, path, []
@@ -244,38 +243,37 @@ def _check_tasks(folder: Path, task: TaskOverride, episode: str) -> None:
     got = f"{old_table.name}: write it as {TABLE}, with the columns video and task"
     require(folder, not old_table.is_file(), expected, got)
     got = f"none: write it, or, if all of them have one task, give it: {_GIVE_TASK}"
-    require(folder, not task.needs_table, expected, got)
+    require(folder, task.text is not None or not task.is_needed, expected, got)
 
 
 def _by_pattern(root: Path, pattern: str, task: TaskOverride, corrections: AskedCorrections) -> EpisodeDataset:
     """Open the files that match a pattern. A table of tasks names the episodes. Raises DatasetError."""
-    require(root, root.is_dir(), "the folder of the recordings", "a file" if root.exists() else "none")
+    require(root, root.is_dir(), "the folder of the recordings", "none")
     found, table = files_of_pattern(root, pattern), root / TABLE
     tasks: Mapping[str, str | None] = dict.fromkeys(found)
     if table.is_file():
-        tasks = read_table_of_tasks(table, has_tasks=task.needs_table)
+        tasks = read_table_of_tasks(table, has_tasks=task.text is None and task.is_needed)
         missing = [name for name in tasks if name not in found]
         got = f"{first_names(missing)}; there are {first_names(found)}"
         require(table, not missing, f"episodes of {pattern}", got)
     else:
         _check_tasks(root, task, "episode")
     episodes = (Episode(name, found[name], own) for name, own in tasks.items())
-    notes = _note(table, "episodes", [name for name in found if name not in tasks])
+    notes = _notes(table, "episodes", [name for name in found if name not in tasks])
     where = table if table.is_file() else root
     return EpisodeDataset(episodes, root, f"pattern {pattern}", where, task, corrections, notes)
 
 
 def _unlisted(table: Path, kind: str, names: Collection[str]) -> list[str]:
-    """A note on episodes that lie beside the table's but are not listed; empty if there are none."""
+    """The episodes that lie beside the table's but are not listed."""
     beside = {table.parent, *((table.parent / name).parent for name in names)} if kind in _SUFFIXES else {table.parent}
     found = [folder / name for folder in sorted(beside) if folder.is_dir() for name in _found(folder).get(kind, ())]
     if kind == "folders of pictures":  # ``_found`` also has folders without pictures
         found = [each for each in found if any(_is_frame(file) for file in each.iterdir())]
-    gone = {Path(os.path.relpath(each, table.parent)).as_posix() for each in found} - set(names)
-    return _note(table, kind, in_natural_order(gone))
+    return in_natural_order({Path(os.path.relpath(each, table.parent)).as_posix() for each in found} - set(names))
 
 
-def _note(table: Path, kind: str, gone: Sequence[str]) -> list[str]:
+def _notes(table: Path, kind: str, gone: Sequence[str]) -> list[str]:
     note = f"{table.name}: {len(gone)} {kind} beside it are not listed and get no labels: {first_names(gone)}"
     return [note] if gone else []
 
@@ -294,8 +292,9 @@ def _listed(folder: Path) -> tuple[str, list[str]]:
     got = f"{examples}: list the episodes of one kind in tasks.csv"
     require(folder, len(found) < 2, "episodes of one kind", got)
     if not any(kind in _KINDS for kind in found):
-        other = f"{'other files' if _names_in(folder) else 'an empty folder'}: {_FILL}"
-        raise DatasetError.at(folder, _LAYOUTS, _unread(folder) or other)
+        other = "other files" if _names_in(folder) else "an empty folder"
+        remedy = f"put a video or a folder of pictures for each episode in it, or {_READER}"
+        raise DatasetError.at(folder, _LAYOUTS, _unread(folder) or f"{other}: {remedy}")
     return next(iter(found.items()))
 
 

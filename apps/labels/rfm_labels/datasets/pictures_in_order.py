@@ -25,6 +25,7 @@ NUMBER = (
 _NUMBER = re.compile(f"({NUMBER})")
 _LETTERS = 2  # minimum word length before a camera number; a time may contain one letter, as in 20261126T123000
 _EXAMPLES = 3  # kinds of names in a message
+_SEPARATORS = "_-. "
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _LEAVE_OUT = "leave it out (--episodes)"
 
@@ -92,20 +93,15 @@ def picture_pattern(files: Sequence[str]) -> str:
     split = [parts for parts in split if len(parts) == length]
     place = max(range(1, length, 2), key=lambda place: len({parts[place] for parts in split}), default=0)
     before, after = (
-        Counter("".join(parts[part]) for parts in split) for part in (slice(place), slice(place + 1, None))
+        Counter("".join(each[:place]) for each in split),
+        Counter("".join(each[place + 1 :]) for each in split),
     )
     start, end = before.most_common(1)[0][0], after.most_common(1)[0][0]
     if len(before) > 1 and len(after) == 1 and "" not in before:
-        start = "{camera}" + _separator({text[-1:] for text in before})
+        start = "{camera}" + start[len(start.rstrip(_SEPARATORS)) :]
     elif len(after) > 1 and len(before) == 1 and "" not in after:
-        end = _separator({text[:1] for text in after}) + "{camera}"
+        end = end[: len(end) - len(end.lstrip(_SEPARATORS))] + "{camera}"
     return f"{start}*{end}{suffix}"
-
-
-def _separator(characters: set[str]) -> str:
-    """The character that all names have there; empty if it is a letter or digit, or differs."""
-    (character,) = characters if len(characters) == 1 else ("",)
-    return "" if character.isalnum() else character
 
 
 def in_natural_order(names: Iterable[str]) -> list[str]:

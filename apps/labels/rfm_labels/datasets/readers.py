@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-import sys
+import runpy
 from collections.abc import Callable, Iterable, Iterator
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import TypeAlias
 
@@ -14,6 +13,7 @@ from rfm_labels.datasets.episodes import Episode, EpisodeDataset
 from rfm_labels.datasets.faults import faults_of_reader, require
 
 Reader: TypeAlias = Callable[[Path], Iterable[Episode]]
+_MODULE = "rfm_reader"  # the name of a reader's module
 
 
 def open_read(reader: str | Reader, folder: Path, task: TaskOverride, corrections: AskedCorrections) -> EpisodeDataset:
@@ -24,8 +24,7 @@ def open_read(reader: str | Reader, folder: Path, task: TaskOverride, correction
 
 def read_episodes(reader: str | Reader, folder: Path) -> Iterator[Episode]:
     """Yield a reader's episodes. Raises DatasetError, for an error in the reader with its line."""
-    got = "a file" if folder.exists() else "none"
-    require(folder, folder.is_dir(), "the folder of the recordings, which the reader is called with", got)
+    require(folder, folder.is_dir(), "the folder of the recordings, which the reader is called with", "none")
     function, where = reader_named(reader) if isinstance(reader, str) else reader, f"reader: {_name_of(reader)}"
     with faults_of_reader(where):
         for episode in function(folder):
@@ -46,13 +45,10 @@ def reader_named(name: str) -> Reader:
     is_name = is_reader(name) and function.isidentifier()
     require("reader", is_name, "FILE.py:FUNCTION, such as my_reader.py:episodes", repr(name))
     require(f"reader: {file}", file.is_file(), "a Python file", "none")
-    spec = spec_from_file_location(f"rfm_reader_{file.stem}", file)
-    assert spec is not None and spec.loader is not None
-    module = sys.modules[spec.name] = module_from_spec(spec)  # dataclasses look their module up
     with faults_of_reader(f"reader: {file}"):
-        spec.loader.exec_module(module)
-    reader: Reader = getattr(module, function, None)  # type: ignore[assignment]  # checked below
-    known = [each for each, value in vars(module).items() if getattr(value, "__module__", "") == spec.name]
+        found = runpy.run_path(str(file), run_name=_MODULE)
+    reader: Reader = found.get(function)  # type: ignore[assignment]  # checked below
+    known = [each for each, value in found.items() if getattr(value, "__module__", "") == _MODULE]
     require(f"reader: {file}", callable(reader), f"a function {function}", ", ".join(known) or "none")
     return reader
 
