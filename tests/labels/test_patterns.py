@@ -124,7 +124,9 @@ def test_a_table_gives_tasks_and_the_order_and_others_are_listed(tmp_path: Path)
 def test_an_episode_without_a_camera_is_left_out_by_the_list_that_is_printed(tmp_path: Path) -> None:
     write(tmp_path, ["0/a.mp4", "1/a.mp4", "1/b.mp4", "2/b.mp4"])
     dataset = open_dataset(tmp_path, videos="{episode}/{camera}.mp4", task=TASK)
-    with pytest.raises(DatasetError, match=r"got a in 2, b in 2; to continue with a alone: --episodes 0:2$"):
+    with pytest.raises(
+        DatasetError, match=r"2: expected a camera .*, got a: missing in 2\nto continue .*: --episodes 0:2$"
+    ):
         label(dataset, BrightnessScorer())
     label(dataset, BrightnessScorer(), LabelOptions(episodes=[0, 1]))
 

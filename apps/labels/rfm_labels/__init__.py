@@ -12,7 +12,6 @@ from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, iter_episodes
 from rfm_labels.datasets.episodes import Episode
 from rfm_labels.datasets.faults import DatasetError
 from rfm_labels.datasets.opening import open_dataset
-from rfm_labels.datasets.readers import check_reader
 from rfm_labels.evaluation import Evaluation, LabelComparison, evaluate_labels
 from rfm_labels.label_files import Curve, EpisodeLabels, find_label_files, read_episode_labels, read_provenance
 from rfm_labels.labelling import Report, label
@@ -39,7 +38,6 @@ __all__ = [
     "Scorer",
     "Summary",
     "Watch",
-    "check_reader",
     "evaluate_labels",
     "find_label_files",
     "iter_episodes",

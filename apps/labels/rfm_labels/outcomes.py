@@ -39,8 +39,7 @@ def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool | 
     """
     if is_reader(source):
         require("outcome", dataset is not None, "the folder of the recordings with a reader", "none")
-        episodes = read_episodes(source, dataset or Path())
-        return {number: None if each.success is None else bool(each.success) for number, each in enumerate(episodes)}
+        return {number: each.success for number, each in enumerate(read_episodes(source, dataset or Path()))}
     if Path(source).suffix.lower() == ".csv":
         return _outcomes(_SUCCESS, _of_csv(Path(source)))
     if dataset is not None and is_hdf5(dataset):

@@ -41,8 +41,7 @@ DatasetArgument = Annotated[
     typer.Argument(
         metavar="DATASET",
         help="LeRobot folder, or Hub id org/name@revision or its address; HDF5 file, or a folder of them; RLDS folder; "
-        "folder of videos, of folders of pictures, or of .npy and .npz files, with tasks.csv; any folder with --videos "
-        "or --reader.",
+        "folder of videos or of folders of pictures, with tasks.csv; any folder with --videos or --reader.",
     ),
 ]
 
@@ -142,14 +141,10 @@ class EpisodeTexts(Settings):
     TITLE: ClassVar[str] = "Dataset"
 
     reader: str | None = setting(
-        None,
-        "Function that yields the episodes of any folder, as rfm_labels.Episode: my_reader.py:episodes.",
-        metavar="FILE.py:FUNCTION",
+        None, "Function that yields the episodes of any folder: my_reader.py:episodes.", metavar="FILE.py:FUNCTION"
     )
     videos: str | None = setting(
-        None,
-        "Videos, or pictures with * for the frame's number, below the folder: '{episode}/videos/{camera}.mp4'.",
-        metavar="PATTERN",
+        None, "Videos or pictures of any folder: '{episode}/videos/{camera}.mp4'.", metavar="PATTERN"
     )
     task: str | None = setting(None, "Task sentence of the episodes that have none.")
     override_task: bool = setting(False, "Put --task in the place of the tasks that episodes have.")
@@ -258,8 +253,7 @@ class LabelCommand:
 
     def run(self) -> ExitCode:
         """Run as the options say. Raises RewardError, OSError and ImportError."""
-        is_read_as_it_is = self.texts.reader is None and self.texts.videos is None
-        if is_read_as_it_is and (files := hdf5_files(self.source)):
+        if not (self.texts.reader or self.texts.videos) and (files := hdf5_files(self.source)):
             return self._run_each(files)
         if self.options.report:
             self._report()

@@ -86,18 +86,14 @@ class AskedCorrections:
         return cls(**asked)
 
     def of_cameras(
-        self,
-        cameras: Sequence[str],
-        turns: Mapping[str, Orientation] | None = None,
-        orders: Mapping[str, ChannelOrder] | None = None,
+        self, cameras: Sequence[str], turns: Mapping[str, Orientation] | None = None
     ) -> Mapping[str, Correction]:
         """Return corrections by camera, for cameras whose frames change. Raises DatasetError for an unknown camera.
 
         turns: default orientations, unless the caller gives one
-        orders: default channel orders, unless the caller gives one
         """
         orient = {**(turns or {}), **_known("orient", self.orient, cameras)}
-        channels = {**(orders or {}), **_known("channels", self.channels, cameras)}
+        channels = _known("channels", self.channels, cameras)
         found = {camera: Correction.of(camera, orient, channels) for camera in cameras}
         return {camera: correction for camera, correction in found.items() if correction != Correction()}
 

@@ -7,21 +7,21 @@ A reader is a function that is called with the recordings' folder and yields an 
 from __future__ import annotations
 
 import itertools
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
+from types import FunctionType
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from rfm_client import InvalidSampleError, RewardError, Trajectory, UInt8Array, load_trajectory
-from rfm_client.frames import ARRAY_SUFFIXES, Picture, Video
-from rfm_client.options import first_names
-from rfm_labels.datasets.dataset import AskedCorrections, CountedDataset, DatasetEpisode, TaskOverride
-from rfm_labels.datasets.faults import DatasetError, faults_of_reader, listed, require
+from rfm_client import UInt8Array
+from rfm_client.frames import Picture, Video
+from rfm_labels.datasets.dataset import AskedCorrections, TaskOverride
+from rfm_labels.datasets.faults import faults_of_reader, require
 from rfm_labels.datasets.pictures_in_order import pictures_in
+from rfm_labels.datasets.recorded import Recorded, RecordedDataset, Stored
 from rfm_labels.datasets.stored_files import (
     Span,
     check_pictures,
@@ -37,6 +37,7 @@ Frames: TypeAlias = UInt8Array | str | Path | Sequence[str | Path] | Callable[[]
 
 MAX_ARRAY_BYTES = 4 * 2**30  # for the arrays that a reader gives, which stay in memory
 _FILES_AT_A_TIME = 8
+_BY_FUNCTION = "give a function for each, with what differs in its arguments: functools.partial(read, file)"
 _FORMS = "uint8 [T, H, W, 3], a path, paths of pictures, or a function that returns frames"
 
 
@@ -47,7 +48,7 @@ class Episode:
     name: another one for each episode
     frames: each camera's T frames, RGB. One of:
         an array, uint8 [T, H, W, 3];
-        the path of a video, of an ``.npy`` or ``.npz`` file, or of a folder with a picture for each frame;
+        the path of a video, or of a folder with a picture for each frame;
         the paths of T pictures, in order;
         a function that reads the frames when they are needed, and each time returns the array or yields T arrays,
         uint8 [H, W, 3]. It is called more than once, by several threads
@@ -77,8 +78,8 @@ class Episode:
         require(f"{where}: task", self.task is None or isinstance(self.task, str), "a sentence", repr(self.task))
         is_rate = self.fps is None or (isinstance(self.fps, int | float) and 0 < self.fps < np.inf)
         require(f"{where}: fps", is_rate, "frames per second, above 0", repr(self.fps))
-        is_outcome = self.success is None or isinstance(self.success, bool | np.bool_)
-        require(f"{where}: success", is_outcome, "True, False or None", repr(self.success))
+        is_outcome = self.success is None or isinstance(self.success, bool)
+        require(f"{where}: success", is_outcome, "True, False or None (bool(...) of NumPy's)", repr(self.success))
 
 
 def _check_form(where: str, frames: Any) -> None:
@@ -87,58 +88,25 @@ def _check_form(where: str, frames: Any) -> None:
         fault = colours_fault(frames) or ("no frames" if not len(frames) else "")
         require(where, not fault, "uint8 [T, H, W, 3]", fault)
         return
-    is_list = isinstance(frames, Sequence) and not isinstance(frames, str | bytes)
-    are_paths = is_list and bool(frames) and all(isinstance(each, str | Path) for each in frames)
-    got = type(frames).__name__
-    if is_list:
-        got += f" of {type(frames[0]).__name__}: np.stack them" if frames else ": no frames"
-    elif isinstance(frames, Iterator):
-        got += ": give the function itself, as functools.partial(read, file)"
-    require(where, isinstance(frames, str | Path) or are_paths or callable(frames), _FORMS, got)
+    are_paths = isinstance(frames, Sequence) and bool(frames) and all(isinstance(each, str | Path) for each in frames)
+    got = f"{type(frames).__name__}: np.stack a list of arrays, and give a function itself, not what it returns"
+    require(where, are_paths or isinstance(frames, Path) or callable(frames), _FORMS, got)
 
 
-class _Stored(ABC):
-    """One camera's frames in one episode. task: in the file"""
-
-    task: str | None = None
-
-    @property
-    @abstractmethod
-    def count(self) -> int:
-        """The number of frames, above 0. Raises DatasetError, also for what else is wrong without decoding."""
-
-    @abstractmethod
-    def identity(self) -> str:
-        """Return a text that identifies the frames, as in ``Dataset.identity``."""
-
-    @abstractmethod
-    def frames(self) -> Iterator[UInt8Array]:
-        """Yield the frames, as ``Dataset.stored_frames``."""
-
-    @staticmethod
-    def decoder() -> str | None:
-        """Return the decoding library; None: pixels, or the reader decodes."""
-        return None
-
-    def check(self) -> None:  # noqa: B027 - ``count`` checks most kinds
-        """Check what ``count`` has not. Raises DatasetError."""
-
-
-class _VideoFile(_Stored):
+class _VideoFile(Stored):
     decoder = staticmethod(Video.decoder)
 
     def __init__(self, file: Path, where: str, opened: Callable[[Path], Video]) -> None:
         self._file, self._where, self._opened = file, where, opened
 
     @cached_property
-    def count(self) -> int:  # type: ignore[override]  # cached
+    def count(self) -> int:
         video = self._opened(self._file)
         video.check_is_one_episode()
         with faults_at(self._file):
             packets = video.packets
-        expected = f"{packets.count} frames with time stamps"
-        require(self._file, len(packets.times_s) == packets.count, expected, len(packets.times_s))
-        require(self._file, packets.count > 0, "frames", "none")
+        num_timed, expected = len(packets.times_s), f"{packets.count or 'some'} frames with time stamps"
+        require(self._file, num_timed == packets.count > 0, expected, num_timed)
         return packets.count
 
     def identity(self) -> str:
@@ -153,7 +121,7 @@ class _VideoFile(_Stored):
         return Span(video, times_s, tolerance_s, self._where).frames()
 
 
-class _Pictures(_Stored):
+class _Pictures(Stored):
     """A picture file for each frame. place: their folder, or their paths in order"""
 
     decoder = staticmethod(Picture.decoder)
@@ -162,14 +130,15 @@ class _Pictures(_Stored):
         self._place = place
 
     @cached_property
-    def count(self) -> int:  # type: ignore[override]  # cached
+    def count(self) -> int:
         return len(self._files())
 
     def _files(self) -> Sequence[Path]:
         return pictures_in(self._place) if isinstance(self._place, Path) else self._place
 
     def identity(self) -> str:
-        return digest_of(f"{file.name} {file_identity(file)}{turn_mark(file)}".encode() for file in self._files())
+        of_files = ((file.name, file_identity(file, what="picture") + turn_mark(file)) for file in self._files())
+        return digest_of(" ".join(each).encode() for each in of_files)
 
     def check(self) -> None:
         check_pictures(self._files())
@@ -178,35 +147,7 @@ class _Pictures(_Stored):
         return picture_frames(self._files())
 
 
-class _ArrayFile(_Stored):
-    """An ``.npy`` or ``.npz`` file, read whole to be checked: only all values show whether they are frames."""
-
-    def __init__(self, file: Path) -> None:
-        self._file = file
-
-    @cached_property
-    def count(self) -> int:  # type: ignore[override]  # cached
-        trajectory = self._read()
-        self.task = trajectory.task or None
-        return trajectory.num_frames
-
-    def identity(self) -> str:
-        return file_identity(self._file)
-
-    def frames(self) -> Iterator[UInt8Array]:
-        return iter(self._read().positions)
-
-    def _read(self) -> Trajectory:
-        try:
-            trajectory = load_trajectory(self._file)
-        except InvalidSampleError as error:
-            raise DatasetError(str(error), self._file) from error
-        got = "embeddings: score them with rfm-client score"
-        require(self._file, trajectory.frames is not None, "frames, uint8 [T, H, W, 3]", got)
-        return trajectory
-
-
-class _Pixels(_Stored):
+class _Pixels(Stored):
     """An array, or a function that returns the frames, called once to count and identify them."""
 
     def __init__(self, given: UInt8Array | Callable[[], Iterable[UInt8Array]], where: str) -> None:
@@ -235,27 +176,25 @@ class _Pixels(_Stored):
                 yield frame
 
 
-def _stored(frames: Frames, where: str, opened: Callable[[Path], Video]) -> _Stored:
+def _stored(frames: Frames, where: str, opened: Callable[[Path], Video]) -> Stored:
     """Return a reader of these frames. opened: opens a video, and keeps a few open"""
     if isinstance(frames, np.ndarray) or callable(frames):
         return _Pixels(frames, where)
     if not isinstance(frames, str | Path):
         return _Pictures([Path(each) for each in frames])
     file = Path(frames)
-    if file.is_dir() or not (file.suffix or file.exists()):
-        return _Pictures(file)
-    return _ArrayFile(file) if file.suffix.lower() in ARRAY_SUFFIXES else _VideoFile(file, where, opened)
+    is_folder = file.is_dir() or not (file.suffix or file.exists())
+    return _Pictures(file) if is_folder else _VideoFile(file, where, opened)
 
 
 def _key(frames: Frames, place: str) -> object:
     """Return a key that two functions share if they read the same: a loop's variable has its last value in both."""
-    if not hasattr(frames, "__code__"):
+    if not isinstance(frames, FunctionType):
         return place
-    bound = (*(frames.__defaults__ or ()), *(frames.__closure__ or ()))
-    return frames.__code__, *map(id, bound)
+    return frames.__code__, *map(id, (*(frames.__defaults__ or ()), *(frames.__closure__ or ())))
 
 
-class EpisodeDataset(CountedDataset):
+class EpisodeDataset(RecordedDataset):
     """The episodes that a reader yields.
 
     root: folder with the recordings
@@ -272,84 +211,27 @@ class EpisodeDataset(CountedDataset):
         where: object,
         task: TaskOverride,
         corrections: AskedCorrections,
+        notes: Sequence[str] = (),
     ) -> None:
-        self.root, self.source, self.kind = root, root.resolve().name, kind
-        self.given_task, self._where = task, where
-        opened = lru_cache(_FILES_AT_A_TIME)(Video)
-        self.given, self.stored = dict[str, Episode](), list[dict[str, _Stored]]()
-        num_bytes, functions = 0, dict[object, str]()
-        for episode in episodes:
-            require(f"{where}: name", episode.name not in self.given, "each once", f"{episode.name!r} again")
-            self.given[episode.name] = episode
-            self.stored.append({})
+        self.root, self.source, self.kind, self.given_task, self.notes = root, root.resolve().name, kind, task, notes
+        opened, names, recorded = lru_cache(_FILES_AT_A_TIME)(Video), set[str](), dict[int, Recorded]()
+        num_bytes, functions, rates = 0, dict[object, str](), list[float | None]()
+        for number, episode in enumerate(episodes):
+            place, cameras = f"{where}: {episode.name}", dict[str, Stored]()
+            require(f"{where}: name", episode.name not in names, "each once", f"{episode.name!r} again")
+            names.add(episode.name)
+            rates.append(episode.fps)
             for camera, frames in episode.frames.items():
-                place = f"{episode.name}: {camera}"
-                num_bytes += frames.nbytes if isinstance(frames, np.ndarray) else 0
-                got = "more, which stay in memory: give functions that read them, as functools.partial(read, file)"
+                num_bytes += 0 if isinstance(frames, np.memmap) else getattr(frames, "nbytes", 0)
                 expected = f"arrays of at most {MAX_ARRAY_BYTES / 2**30:g} GiB in all episodes"
-                require(f"{where}: {place}", num_bytes <= MAX_ARRAY_BYTES, expected, got)
-                same = functions.setdefault(_key(frames, place), place)
-                got = f"that of {same}: bind what differs, as functools.partial(read, file)"
-                require(f"{where}: {place}", same == place, "a function of its own", got)
-                self.stored[-1][camera] = _stored(frames, place, opened)
-        require(where, bool(self.given), "at least one episode", "none")
-        self.numbers = range(len(self.given))
-        self._names = list(self.given)
-        known = list(dict.fromkeys(camera for each in self.stored for camera in each))
-        self.cameras, self.left_out = self._shared(self.numbers)
-        self.corrections = corrections.of_cameras(known)
-        self.fps = next((each.fps for each in self.given.values() if each.fps), None)
-
-    def _shared(self, numbers: Sequence[int]) -> tuple[list[str], dict[str, str]]:
-        """The cameras of all these episodes, and which episode lacks each other camera."""
-        cameras = dict.fromkeys(camera for number in numbers for camera in self.stored[number])
-        lacking = {
-            camera: [self._names[number] for number in numbers if camera not in self.stored[number]]
-            for camera in cameras
-        }
-        left_out = {camera: f"missing in {first_names(names, 1)}" for camera, names in lacking.items() if names}
-        return [camera for camera in cameras if camera not in left_out], left_out
-
-    def cameras_in(self, numbers: Sequence[int]) -> tuple[Sequence[str], Mapping[str, str]]:
-        cameras, left_out = self._shared(numbers)
-        if not cameras:
-            having = {camera: [n for n in numbers if camera in self.stored[n]] for camera in left_out}
-            best = max(having, key=lambda camera: len(having[camera]))
-            got = f"{', '.join(f'{camera} in {len(those)}' for camera, those in having.items())}"
-            expected = f"a camera that all {len(numbers)} episodes have"
-            remedy = f"to continue with {best} alone: --episodes {listed(having[best])}"
-            raise DatasetError.at(self._where, expected, f"{got}; {remedy}")
-        return cameras, left_out
-
-    def length(self, number: int) -> int:
-        """The frame count of the first camera that can be read. Raises DatasetError."""
-        faults = []
-        for stored in self.stored[number].values():
-            try:
-                return stored.count
-            except RewardError as fault:
-                faults.append(fault)
-        raise faults[0]
-
-    def read_episode(self, number: int) -> DatasetEpisode:
-        name, length = self._names[number], self.length(number)
-        own = self.given[name].task or next(filter(None, (each.task for each in self.stored[number].values())), None)
-        task = self.given_task.of(f"{self._where}: {name}", own)
-        return DatasetEpisode(number, name, " ".join(task.split()), length, self.frames_before(number))
-
-    def decoder(self, camera: str) -> str | None:
-        kinds = {type(each[camera]) for each in self.stored if camera in each}
-        return ", ".join(sorted(filter(None, (kind.decoder() for kind in kinds)))) or None
-
-    def identity(self, episode: DatasetEpisode, camera: str) -> str:
-        return self.stored[episode.index][camera].identity()
-
-    def check(self, episode: DatasetEpisode, camera: str) -> None:
-        stored = self.stored[episode.index][camera]
-        got = f"{stored.count}: cut them alike, or leave the episode out (--episodes)"
-        expected = f"{episode.num_frames} frames, as the other cameras"
-        require(self.place(episode, camera), stored.count == episode.num_frames, expected, got)
-        stored.check()
-
-    def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        return self.stored[episode.index][camera].frames()
+                require(f"{place}: {camera}", num_bytes <= MAX_ARRAY_BYTES, expected, f"more: {_BY_FUNCTION}")
+                own = f"{episode.name}: {camera}"
+                same = functions.setdefault(_key(frames, own), own)
+                require(f"{place}: {camera}", same == own, "a function of its own", f"that of {same}: {_BY_FUNCTION}")
+                cameras[camera] = _stored(frames, own, opened)
+            missing = f"missing in {episode.name}"
+            recorded[number] = Recorded(episode.name, place, episode.task, place, cameras, missing)
+        require(where, bool(recorded), "at least one episode", "none")
+        self.corrections = corrections.of_cameras(self.set_recorded(recorded))
+        self.numbers = range(len(recorded))  # finds a number at once
+        self.fps = next(filter(None, rates), None)

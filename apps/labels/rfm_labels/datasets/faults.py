@@ -99,8 +99,8 @@ def faults_of_reader(where: object) -> Iterator[None]:
         raise
     except Exception as error:
         lines = extract_tb(error.__traceback__)
-        own = [line for line in lines if not any(part in line.filename for part in _OTHERS_CODE)] or lines
-        got = f"{type(error).__name__}: {error} ({Path(own[-1].filename).name}, line {own[-1].lineno})"
+        last = [each for each in lines if not any(part in each.filename for part in _OTHERS_CODE)][-1:] or lines[-1:]
+        got = f"{type(error).__name__}: {error} ({Path(last[0].filename).name}, line {last[0].lineno})"
         raise DatasetError.at(where, "a reader that runs", got) from error
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +21,6 @@ DOCUMENTS = ("problem_info", "env_args")  # attributes of ``data`` that hold a J
 _SENTENCES = ("language_instruction", "language", "lang")  # keys for the task in problem_info and env_args
 _DEFAULT_FPS = 20.0  # robosuite's
 _STARTS = (b"\xff\xd8\xff", b"\x89PNG")  # first bytes in JPEG and PNG files
-_READERS = {  # examples/readers of other layouts, by a name at the top of the file
-    "observations": "aloha.py, or robomind.py for observations/rgb_images",
-    "observation": "robotwin.py",
-    "traj_0": "maniskill.py",
-    "episode_0": "minari_pictures.py",
-}
 
 
 @contextmanager
@@ -62,22 +56,15 @@ def filter_keys(opened: Any) -> Mapping[str, Sequence[int]]:
     """Return the demonstration numbers in each ``mask`` dataset with names of demonstrations."""
     found: dict[str, Sequence[int]] = {}
     for key, stored in members_of(opened.get("mask")).items():
-        texts = texts_in(stored)
-        names = [re.fullmatch(r"demo_(0|[1-9]\d*)", text) for text in texts or ()]
-        if texts is not None and None not in names:
+        try:
+            values = np.ravel(stored[()]).tolist()
+        except (OSError, RuntimeError, TypeError, ValueError):
+            continue
+        texts = [value.decode(errors="replace") if isinstance(value, bytes) else str(value) for value in values]
+        names = [re.fullmatch(r"demo_(0|[1-9]\d*)", text) for text in texts]
+        if None not in names:
             found[key] = sorted({int(name[1]) for name in names if name})
     return found
-
-
-def texts_in(stored: Any) -> list[str] | None:
-    """Read the texts in a dataset; None if it holds something else or cannot be read."""
-    if getattr(stored, "shape", None) is None:
-        return None
-    try:
-        values = np.ravel(stored[()]).tolist()
-    except (OSError, RuntimeError, TypeError, ValueError):
-        return None
-    return [value.decode(errors="replace") if isinstance(value, bytes) else str(value) for value in values]
 
 
 def is_of_libero(attributes: Mapping[str, Any]) -> bool:
@@ -140,10 +127,9 @@ def demonstrations(file: Path, opened: Any) -> dict[int, tuple[str, Any]]:
             twice = f"{found.get(number, ('', None))[0]} and {name}: rename one of them"
             require(f"{file}: data", number not in found, "one demonstration of each number", twice)
             found[number] = name, group
-    top = members_of(opened)
-    known = next((each for name, each in _READERS.items() if name in top), "a function of ten lines")
-    got = first_names(members) or f"none: the file holds {first_names(top) or 'nothing'}"
-    got += f"; a reader opens other layouts (--reader examples/readers/{known})" * ("data" not in top)
+    top = first_names(members_of(opened)) or "nothing"
+    others = "a reader opens other layouts, as those of ALOHA, ManiSkill, Minari and RoboTwin in examples/readers"
+    got = first_names(members) or f"none: the file holds {top}; {others}"
     require(f"{file}: data", bool(found), "demo_0, demo_1 and so on", got)
     return dict(sorted(found.items()))
 
@@ -151,15 +137,12 @@ def demonstrations(file: Path, opened: Any) -> dict[int, tuple[str, Any]]:
 def observations(group: Any, folder: str) -> dict[str, Any]:
     """Return a demonstration's observations by name; None for one that cannot be opened or that NumPy does not know."""
     found = members_of(group.get(folder) if hasattr(group, "keys") else None)
-    return {name: value if _is_known(value) else None for name, value in found.items()}
-
-
-def _is_known(value: Any) -> bool:
-    """True for a group, or an array with numbers or texts that NumPy knows."""
-    try:
-        return hasattr(value, "keys") or (getattr(value, "shape", None) is not None and bool(value.dtype.kind))
-    except (TypeError, OSError, RuntimeError):
-        return False
+    known: dict[str, Any] = dict.fromkeys(found)
+    for name, value in found.items():
+        with suppress(TypeError, OSError, RuntimeError):
+            if hasattr(value, "keys") or (getattr(value, "shape", None) is not None and value.dtype.kind):
+                known[name] = value
+    return known
 
 
 def task_of(opened: Any, demo: Any) -> Any:

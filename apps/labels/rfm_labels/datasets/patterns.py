@@ -20,7 +20,6 @@ from rfm_labels.datasets.faults import require
 from rfm_labels.datasets.pictures_in_order import NUMBER, PICTURE_SUFFIXES, in_natural_order, picture_pattern
 
 _PART = re.compile(r"(\{\w*\}|\*)")
-_EXAMPLE = "{episode}/videos/{camera}.mp4"
 _MOST_FILES = 10_000  # that a suggestion is made from
 _CAMERA = re.compile(r"(cam|color|colour|image|img|rgb|view)", re.IGNORECASE)
 
@@ -30,7 +29,7 @@ def files_of_pattern(root: Path, pattern: str) -> Mapping[str, Mapping[str, Fram
 
     Episodes sort by name, with 2 before 10. Raises DatasetError.
     """
-    expression, are_pictures = _expression(pattern), _suffix(pattern) in PICTURE_SUFFIXES
+    expression, are_pictures = _expression(pattern), Path(pattern).suffix.lower() in PICTURE_SUFFIXES
     found: dict[str, dict[str, dict[tuple[Decimal, ...], Path]]] = {}
     others: list[str] = []
     for name in files_below(root):
@@ -56,19 +55,15 @@ def files_of_pattern(root: Path, pattern: str) -> Mapping[str, Mapping[str, Fram
     }
 
 
-def _suffix(pattern: str) -> str:
-    return Path(pattern).suffix.lower()
-
-
 def _expression(pattern: str) -> re.Pattern[str]:
     """Compile a pattern. Raises DatasetError."""
     parts = _PART.split(pattern)
     fields, folders = sorted(parts[1::2]), pattern.rpartition("/")[0]
     is_known = set(fields) <= {"*", "{camera}", "{episode}"} and fields.count("{episode}") == 1
     is_known = is_known and fields.count("{camera}") < 2 and not {"", "..", "."} & set(pattern.split("/"))
-    expected = f"{{episode}} once and {{camera}} at most once in a path below the folder, as '{_EXAMPLE}'"
+    expected = "{episode} once and {camera} at most once in a path below the folder: '{episode}/videos/{camera}.mp4'"
     require("videos", is_known, expected, repr(pattern))
-    is_numbered = _suffix(pattern) in PICTURE_SUFFIXES
+    is_numbered = Path(pattern).suffix.lower() in PICTURE_SUFFIXES
     has_number = not is_numbered or "*" in pattern.removeprefix(folders)
     require("videos", has_number, "a * for the frame's number in a picture's name, as '{episode}/*.jpg'", repr(pattern))
     texts, length = [], 0
@@ -96,22 +91,20 @@ def suggested_pattern(root: Path, example: str) -> str:
     names = [Path(name) for name in itertools.islice(alike, _MOST_FILES)]
     *columns, files = zip(*(name.parts for name in names), strict=True)
     if suffix.lower() in PICTURE_SUFFIXES:
-        beside = Path(example).parent
-        name = picture_pattern(each.name for each in names if each.parent == beside)
+        parts = [picture_pattern([each.name for each in names if each.parent == Path(example).parent])]
     else:
-        name = _part([Path(each).stem for each in files], "{camera}") if len(names) > 1 else "{episode}"
-        name += suffix
-    names_episode, folders = "{episode}" in name, list[str]()
+        parts = [(_part([Path(each).stem for each in files], "{camera}") if len(names) > 1 else "{episode}") + suffix]
+    is_of_episode = "{episode}" in parts[0]
     for column in reversed(columns):
-        if "{episode}" in folders:  # which stands for the folders above it, too
+        if "{episode}" in parts:  # which stands for the folders above it, too
             break
-        part = _part(column, "" if "{camera}" in "".join((*folders, name)) else "{camera}")
-        folders.insert(0, "*" if names_episode and part == "{episode}" else part)
-    if names_episode and "{camera}" not in folders:
-        return name
-    if not names_episode and "{episode}" not in folders:
-        folders[0] = "{episode}"
-    return "/".join((*folders, name))
+        part = _part(column, "" if "{camera}" in "".join(parts) else "{camera}")
+        parts.insert(0, "*" if is_of_episode and part == "{episode}" else part)
+    if is_of_episode and "{camera}" not in parts:
+        return parts[-1]
+    if not is_of_episode and "{episode}" not in parts:
+        parts[0] = "{episode}"
+    return "/".join(parts)
 
 
 def _part(values: Sequence[str], camera: str) -> str:

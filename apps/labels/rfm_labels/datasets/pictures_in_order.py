@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -25,6 +25,7 @@ NUMBER = (
 _NUMBER = re.compile(f"({NUMBER})")
 _LETTERS = 2  # minimum word length before a camera number; a time may contain one letter, as in 20261126T123000
 _EXAMPLES = 3  # kinds of names in a message
+_SEPARATORS = "_-. "
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _LEAVE_OUT = "leave it out (--episodes)"
 
@@ -35,21 +36,13 @@ class _Name:
 
     file: str
     words: tuple[str, ...]
-    digits: tuple[str, ...]
     numbers: tuple[Decimal, ...]
 
     @classmethod
     def of(cls, file: str) -> _Name:
         parts = _NUMBER.split(Path(file).stem)
-        digits = tuple(parts[1::2])
         form = Path(file).suffix.lower().replace("jpeg", "jpg")
-        return cls(file, (*parts[::2], form), digits, tuple(map(Decimal, digits)))
-
-    def kind(self, place: int | None) -> str:
-        """The name with ``*`` for all numbers but the one at ``place``."""
-        shown = ["*" if number != place else digits for number, digits in enumerate(self.digits)]
-        parts = [self.words[0], *(part for pair in zip(shown, self.words[1:-1], strict=True) for part in pair)]
-        return "".join(parts) + Path(self.file).suffix
+        return cls(file, (*parts[::2], form), tuple(map(Decimal, parts[1::2])))
 
 
 def in_order_of_numbers(folder: Path, files: Sequence[str]) -> list[str]:
@@ -59,20 +52,17 @@ def in_order_of_numbers(folder: Path, files: Sequence[str]) -> list[str]:
     """
     names = sorted(map(_Name.of, files), key=lambda name: (name.numbers, name.file))
     if len({name.words for name in names}) > 1:
-        raise _several_kinds(folder, names, None)
+        raise _several_kinds(folder, files)
     for before, name in itertools.pairwise(names):
         got = f"{before.file} and {name.file}: leave the episode out (--episodes)"
         require(folder, before.numbers != name.numbers, "each number once", got)
-    places = range(len(names[0].numbers)) if names else ()
-    num_cameras = {place: _num_cameras(names, place) for place in places}
-    of_cameras = [place for place in places if num_cameras[place]]
-    if of_cameras:
-        raise _several_kinds(folder, names, min(of_cameras, key=lambda place: num_cameras[place]))
+    if any(_counts_cameras(names, place) for place in range(len(names[0].numbers) if names else 0)):
+        raise _several_kinds(folder, files)
     return [name.file for name in names]
 
 
-def _num_cameras(names: Sequence[_Name], place: int) -> int:
-    """How many cameras the numbers at a place count; 0 if they count frames.
+def _counts_cameras(names: Sequence[_Name], place: int) -> bool:
+    """True if the numbers at a place count cameras, and not frames.
 
     All cameras have the same frames, so names repeat once the camera number is removed. Times such as ``12_500`` (s,
     ms) may repeat by chance, so either all names must repeat, or the number must belong to a word, as in ``cam1_0001``.
@@ -81,46 +71,37 @@ def _num_cameras(names: Sequence[_Name], place: int) -> int:
     values = {name.numbers[place] for name in names}
     word = names[0].words[place][-_LETTERS:]
     is_in_word = len(word) == _LETTERS and word.isalpha()
-    repeats = 1 < len(others) < len(names)
-    return len(values) if repeats and (is_in_word or len(others) * len(values) == len(names)) else 0
+    return 1 < len(others) < len(names) and (is_in_word or len(others) * len(values) == len(names))
 
 
-def _several_kinds(folder: Path, names: Sequence[_Name], place: int | None) -> DatasetError:
+def _several_kinds(folder: Path, files: Sequence[str]) -> DatasetError:
     """The error for several kinds of names."""
-    kinds: Mapping[str, int] = Counter(name.kind(place) for name in names)
-    shortest = sorted(kinds, key=lambda kind: (len(kind), kind))
-    examples = " and ".join(f"{kind} ({kinds[kind]})" for kind in shortest[:_EXAMPLES])
+    kinds = Counter(_NUMBER.sub("*", Path(file).stem) + Path(file).suffix for file in files)
+    examples = " and ".join(f"{kind} ({count})" for kind, count in kinds.most_common(_EXAMPLES))
     if max(kinds.values()) == 1:
         remedy = "copy them to a folder of their own, as 0.png and 1.png"
         return DatasetError.at(folder, "names that differ in a number", f"{examples}: {remedy}")
-    got = f"{examples}: name the cameras, as --videos '{{episode}}/{picture_pattern([name.file for name in names])}'"
+    got = f"{examples}: name the frame's number and the camera, as --videos '{{episode}}/{picture_pattern(files)}'"
     return DatasetError.at(folder, "pictures of one camera, whose names differ in a number", got)
 
 
-def picture_pattern(files: Iterable[str]) -> str:
+def picture_pattern(files: Sequence[str]) -> str:
     """Return a pattern for an episode's pictures: ``*`` for the frame's number, ``{camera}`` for names that differ."""
-    files = list(files)
     suffix, _ = Counter(Path(file).suffix for file in files).most_common(1)[0]
     split = [_NUMBER.split(Path(file).stem) for file in files if Path(file).suffix == suffix]
     length, _ = Counter(map(len, split)).most_common(1)[0]
     split = [parts for parts in split if len(parts) == length]
     place = max(range(1, length, 2), key=lambda place: len({parts[place] for parts in split}), default=0)
     before, after = (
-        Counter("".join(parts[:place]) for parts in split),
-        Counter("".join(parts[place + 1 :]) for parts in split),
+        Counter("".join(each[:place]) for each in split),
+        Counter("".join(each[place + 1 :]) for each in split),
     )
     start, end = before.most_common(1)[0][0], after.most_common(1)[0][0]
-    if len(before) > 1 and len(after) == 1:
-        start = "{camera}" + _separator({text[-1:] for text in before})
-    elif len(after) > 1 and len(before) == 1:
-        end = _separator({text[:1] for text in after}) + "{camera}"
+    if len(before) > 1 and len(after) == 1 and "" not in before:
+        start = "{camera}" + start[len(start.rstrip(_SEPARATORS)) :]
+    elif len(after) > 1 and len(before) == 1 and "" not in after:
+        end = end[: len(end) - len(end.lstrip(_SEPARATORS))] + "{camera}"
     return f"{start}*{end}{suffix}"
-
-
-def _separator(characters: set[str]) -> str:
-    """The character that all names have there; empty if it is a letter or digit, or differs."""
-    (character,) = characters if len(characters) == 1 else ("",)
-    return "" if character.isalnum() else character
 
 
 def in_natural_order(names: Iterable[str]) -> list[str]:

@@ -3,27 +3,20 @@
 
 from __future__ import annotations
 
-import sys
+import runpy
 from collections.abc import Callable, Iterable, Iterator
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import TypeAlias
-
-import numpy as np
 
 from rfm_labels.datasets.dataset import AskedCorrections, TaskOverride
 from rfm_labels.datasets.episodes import Episode, EpisodeDataset
 from rfm_labels.datasets.faults import faults_of_reader, require
 
 Reader: TypeAlias = Callable[[Path], Iterable[Episode]]
+_MODULE = "rfm_reader"  # the name of a reader's module
 
 
-def open_read(
-    reader: str | Reader,
-    folder: Path,
-    task: TaskOverride = TaskOverride(),
-    corrections: AskedCorrections = AskedCorrections(),
-) -> EpisodeDataset:
+def open_read(reader: str | Reader, folder: Path, task: TaskOverride, corrections: AskedCorrections) -> EpisodeDataset:
     """Call a reader, and return its episodes as a dataset. Raises DatasetError."""
     name = _name_of(reader)
     return EpisodeDataset(read_episodes(reader, folder), folder, f"reader {name}", name, task, corrections)
@@ -31,48 +24,13 @@ def open_read(
 
 def read_episodes(reader: str | Reader, folder: Path) -> Iterator[Episode]:
     """Yield a reader's episodes. Raises DatasetError, for an error in the reader with its line."""
-    got = "a file" if folder.exists() else "none"
-    require(folder, folder.is_dir(), "the folder of the recordings, which the reader is called with", got)
+    require(folder, folder.is_dir(), "the folder of the recordings, which the reader is called with", "none")
     function, where = reader_named(reader) if isinstance(reader, str) else reader, f"reader: {_name_of(reader)}"
     with faults_of_reader(where):
         for episode in function(folder):
             expected = "rfm_labels.Episode(name, frames) of each recording"
             require(where, isinstance(episode, Episode), expected, type(episode).__name__)
             yield episode
-
-
-def check_reader(reader: str | Reader, folder: str | Path, num_decoded: int = 3) -> list[str]:
-    """Check a reader on recordings: call it twice, and compare. Return a line for each episode.
-
-    num_decoded: of so many episodes, spread over all of them, all frames are decoded twice
-
-    Raises DatasetError for episodes or frames that differ, and for everything that a label run refuses but a missing
-    task.
-    """
-    first, second = (open_read(reader, Path(folder), TaskOverride(is_needed=False)) for _ in range(2))
-    where = f"reader: {_name_of(reader)}"
-    both = [
-        [(each.name, each.task, sorted(each.frames)) for each in dataset.given.values()] for dataset in (first, second)
-    ]
-    for number, (one, other) in enumerate(zip(*both, strict=False)):
-        require(f"{where}: episode {number}", one == other, f"the same each time: {one}", other)
-    counts = [len(each) for each in both]
-    require(where, counts[0] == counts[1], "the same episodes each time", f"{counts[0]}, then {counts[1]}")
-    decoded = {round(place * (len(both[0]) - 1) / max(num_decoded - 1, 1)) for place in range(num_decoded)}
-    lines = []
-    for episode in first.episodes:
-        cameras = []
-        for camera, stored in first.stored[episode.index].items():
-            first.check(episode, camera)
-            size = ""
-            if episode.index in decoded:
-                shown = [list(dataset.whole_frames(episode, camera)) for dataset in (first, second)]
-                is_same = all(map(np.array_equal, *shown))
-                require(f"{where}: {episode.name}: {camera}", is_same, "the same frames each time", "others")
-                size = " x ".join(map(str, ("", *shown[0][0].shape[:2])))
-            cameras.append(f"{camera} {stored.count}{size}")
-        lines.append(f"{episode.name}: {', '.join(cameras)}: {episode.task or 'no task: give --task'}")
-    return lines
 
 
 def _name_of(reader: str | Reader) -> str:
@@ -87,17 +45,10 @@ def reader_named(name: str) -> Reader:
     is_name = is_reader(name) and function.isidentifier()
     require("reader", is_name, "FILE.py:FUNCTION, such as my_reader.py:episodes", repr(name))
     require(f"reader: {file}", file.is_file(), "a Python file", "none")
-    spec = spec_from_file_location(f"rfm_reader_{file.stem}", file)
-    assert spec is not None and spec.loader is not None
-    module = sys.modules[spec.name] = module_from_spec(spec)  # dataclasses look their module up
     with faults_of_reader(f"reader: {file}"):
-        spec.loader.exec_module(module)
-    reader = getattr(module, function, None)
-    known = [
-        each
-        for each, value in vars(module).items()
-        if callable(value) and getattr(value, "__module__", "") == spec.name
-    ]
+        found = runpy.run_path(str(file), run_name=_MODULE)
+    reader: Reader = found.get(function)  # type: ignore[assignment]  # checked below
+    known = [each for each, value in found.items() if getattr(value, "__module__", "") == _MODULE]
     require(f"reader: {file}", callable(reader), f"a function {function}", ", ".join(known) or "none")
     return reader
 
