@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from pyarrow import parquet
 
 from labelling import FRONT, LEROBOT, BrightnessScorer
 from rfm_client import UInt8Array
-from rfm_labels import LabelOptions, RayOptions, open_dataset
+from rfm_labels import Dataset, Episode, LabelOptions, RayOptions, open_dataset
 from rfm_labels.audit import MOST_DECODED, audit
 from rfm_labels.commands import EpisodeTexts, LabelCommand, RunOptions
 
@@ -30,6 +31,11 @@ def moving(first: int, count: int = 4) -> UInt8Array:
     return frames
 
 
+def opened(folder: Path, clips: Sequence[UInt8Array]) -> Dataset:
+    episodes = [Episode(f"{number:03d}", {"front": clip}, task="push the cube") for number, clip in enumerate(clips)]
+    return open_dataset(folder, reader=lambda _: episodes)
+
+
 def test_frozen_blank_and_stale_frames_are_doubted(tmp_path: Path) -> None:
     stale = moving(2)
     before = moving(11)
@@ -42,9 +48,7 @@ def test_frozen_blank_and_stale_frames_are_doubted(tmp_path: Path) -> None:
         np.zeros((4, 16, 16, 3), np.uint8),
         moving(1),
     ]
-    for number, frames in enumerate(episodes):
-        np.save(tmp_path / f"episode_{number}.npy", frames)
-    dataset = open_dataset(tmp_path, task="push the cube")
+    dataset = opened(tmp_path, episodes)
     doubts = [(each.episode, each.text) for each in audit(dataset, dataset.episodes, dataset.cameras)]
     assert doubts == [
         (2, "the first frame equals the last of the episode before, then the picture jumps"),
@@ -54,9 +58,7 @@ def test_frozen_blank_and_stale_frames_are_doubted(tmp_path: Path) -> None:
 
 
 def test_a_large_dataset_is_sampled_in_pairs(tmp_path: Path) -> None:
-    for number in range(MOST_DECODED + 10):
-        np.save(tmp_path / f"episode_{number}.npy", np.zeros((2, 8, 8, 3), np.uint8))
-    dataset = open_dataset(tmp_path, task="push the cube")
+    dataset = opened(tmp_path, [np.zeros((2, 8, 8, 3), np.uint8)] * (MOST_DECODED + 10))
     episodes = [each.episode for each in audit(dataset, dataset.episodes, dataset.cameras)]
     assert len(episodes) == MOST_DECODED
     assert {0, 1, MOST_DECODED + 8, MOST_DECODED + 9} <= {*episodes}
