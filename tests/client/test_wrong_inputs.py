@@ -23,11 +23,10 @@ STARTED = "start the server there (rfm serve), or give the URL of one that runs 
 URL = "expected grpc://host:port or http://host:port, or grpcs:// or https:// (brackets around an IPv6 address), got"
 DATASET = (
     "expected a LeRobot dataset (meta/info.json), an RLDS dataset (features.json), an HDF5 file (.hdf5, .h5), a folder "
-    "of videos, of folders of pictures or of .npy and .npz files with tasks.csv, or a Hub id "
+    "of videos or of folders of pictures with tasks.csv, any folder with --videos or --reader, or a Hub id "
     "org/name[@revision], got"
 )
 PAIR = "expected a certificate and its key (PEM, unencrypted) at"
-SHOWN = "expected the folder of a LeRobot (meta/info.json) or RLDS dataset (features.json), or an HDF5 file, got"
 SOURCE = "checkpoint: expected a folder that exists or a Hugging Face id org/name[/subfolder][@tag], got"
 
 
@@ -92,7 +91,7 @@ USAGE = {
     f"rfm-client gateway --triton {NOBODY} --metrics-url nope": bad(
         "--metrics-url", "expected http://host:port/metrics, got 'nope'"
     ),
-    f"rfm-client gateway --triton {NOBODY} --dataset file.txt": bad("--dataset", f"{SHOWN} file.txt"),
+    f"rfm-client gateway --triton {NOBODY} --dataset nope": bad("--dataset", f"{DATASET} nope"),
     "rfm-client label dataset --override-task": "Invalid value: --override-task needs --task",
     "rfm score a.mp4": "No such command 'score': that is `rfm-client score`",
     "rfm serve": "Invalid value: give FOLDER or --repository",
@@ -129,7 +128,7 @@ FAILURES = {
         *(1, "--grpc-certificate: expected client certificates (--grpc-client-ca) at 10.0.0.5, "),
         "since TLS alone asks callers for nothing, got none; --grpc-any-client serves everyone",
     ),
-    "rfm serve repository --gateway-port FREE_PORT --gateway-dataset nope": (1, f"--gateway-dataset: {SHOWN} nope"),
+    "rfm serve repository --gateway-port FREE_PORT --gateway-dataset nope": (1, f"--gateway-dataset: {DATASET} nope"),
     "rfm serve repository --config mistake.yaml": (
         *(1, "mistake.yaml: expected a YAML file, got a mistake in line 2 "),
         "(expected the node content, but found '<stream end>')",

@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import pytest
 from PIL import Image
 
 import hdf5_writers
-from hdf5_writers import TASK, decoded, jpeg, video
+from hdf5_writers import TASK, video
 from labelling import LEROBOT, WRIST, BrightnessScorer, brightness
 from paths import ROOT
 from pictures import numbered, numbers, write_video
@@ -35,13 +34,18 @@ class Written:
     """A dataset on disk.
 
     episodes: number, task, and the frames of each camera; None: other tests compare the frames
-    spoil: breaks the second episode; None: the dataset has one episode, or other tests break it
+    spoil: breaks the second episode; None: other tests break it
+    more: further arguments of ``open_dataset``
     """
 
     source: Path
     episodes: list[tuple[int, str, Frames | None]]
     spoil: Callable[[], object] | None = None
     task: str | None = None
+    more: Mapping[str, Any] = field(default_factory=dict)
+
+    def open(self, **opening: Any) -> Dataset:
+        return open_dataset(self.source, **{"task": self.task, **self.more, **opening})
 
 
 def lerobot(name: str) -> Callable[[Path], Written]:
@@ -68,35 +72,6 @@ def robomimic(folder: Path) -> Written:
             opened["data/demo_4/actions"] = np.zeros((2, 7))
 
     return Written(file, [(number, TASK, cameras) for number, cameras in frames.items()], spoil)
-
-
-def of_files(write: Callable[..., Path], mark: bytes = b"", **more: Any) -> Callable[[Path], Written]:
-    """A file of one episode, whose frames are JPEG files."""
-
-    def written(folder: Path) -> Written:
-        stored: dict[str, Any] = {
-            name: [jpeg(frame, mark) for frame in video(4, seed)] for seed, name in enumerate(("high", "left"))
-        }
-        pixels = {name: np.stack([decoded(each) for each in files]) for name, files in stored.items()}
-        if write is hdf5_writers.write_aloha:
-            stored["raw"] = pixels["raw"] = video(4, 5)
-        elif write is hdf5_writers.write_robomind:
-            stored["high"][2] = pixels["high"][2][..., ::-1].tobytes()  # pixels as OpenCV has them
-        elif not mark:
-            pixels = {name: frames[..., ::-1] for name, frames in pixels.items()}  # RoboTwin's before its mark
-        return Written(write(folder / "data" / "episode_0.hdf5", stored, **more), [(0, TASK, pixels)])
-
-    return written
-
-
-def robotwin(file: Path, files: Any) -> Path:
-    return hdf5_writers.write_robotwin(file.parent, files)
-
-
-def maniskill(folder: Path) -> Written:
-    frames = {3: {"base_camera": CLIPS[0]}, 12: {"base_camera": CLIPS[1]}}
-    file = hdf5_writers.write_maniskill(folder / "trajectory.h5", frames)
-    return Written(file, [(number, TASK, cameras) for number, cameras in frames.items()], task=TASK)
 
 
 def arena(folder: Path) -> Written:
@@ -142,45 +117,57 @@ def pictures(folder: Path) -> Written:
     return Written(folder, episodes, lambda: (folder / "1" / "frame_9.png").write_bytes(b"no picture"), task=TASK)
 
 
-def unitree(folder: Path) -> Written:
-    """xr_teleoperate: the pictures of all cameras in one folder; ``data.json`` names frames, cameras and the task."""
+def pattern(folder: Path) -> Written:
+    """Pictures of all cameras in one folder for each episode."""
     episodes: list[Any] = []
     for number, clip in enumerate(CLIPS):
-        rows, cameras = [], {"color_0": clip, "color_1": clip[:, ::-1]}
-        (folder / f"episode_{number:04d}" / "colors").mkdir(parents=True)
-        for t in range(len(clip)):
-            names = {camera: f"colors/{t:06d}_{camera}.png" for camera in cameras}
-            for camera, name in names.items():
-                Image.fromarray(cameras[camera][t]).save(folder / f"episode_{number:04d}" / name)
-            rows.append({"idx": t, "colors": names, "depths": {}})
-        told = {"text": {"goal": TASK}, "data": rows}
-        (folder / f"episode_{number:04d}" / "data.json").write_text(json.dumps(told))
+        cameras = {"color_0": clip, "color_1": clip[:, ::-1]}
+        (folder / f"episode_{number}" / "colors").mkdir(parents=True)
+        for camera, frames in cameras.items():
+            for t, frame in enumerate(frames):
+                Image.fromarray(frame).save(folder / f"episode_{number}" / "colors" / f"{t + 8}_{camera}.png")
         episodes.append((number, TASK, cameras))
-    return Written(folder, episodes, lambda: (folder / "episode_0001" / "data.json").write_text('{"data": [{}'))
+    spoil = lambda: (folder / "episode_1/colors/9_color_1.png").write_bytes(b"no picture")  # noqa: E731
+    return Written(folder, episodes, spoil, task=TASK, more={"videos": "{episode}/colors/*_{camera}.png"})
 
 
-def arrays(folder: Path) -> Written:
+READER = """
+from functools import partial
+import numpy as np
+from rfm_labels import Episode
+
+def episodes(folder):
+    for file in sorted(folder.glob("*.npy")):
+        yield Episode(file.stem, {"array": np.load(file, mmap_mode="r"), "function": partial(mirrored, folder / "later" / file.name)}, task=f"task {file.stem}")
+
+def mirrored(file):
+    for frame in np.load(file):
+        yield frame[:, ::-1]
+"""
+
+
+def reader(folder: Path) -> Written:
+    file = folder.parent / "my_reader.py"
+    file.write_text(READER)
+    (folder / "later").mkdir()
     for number, clip in enumerate(CLIPS):
-        np.savez(folder / f"{number}.npz", frames=clip, task=f"task {number}")
-    episodes: list[Any] = [(number, f"task {number}", {"frames": clip}) for number, clip in enumerate(CLIPS)]
-    return Written(folder, episodes, lambda: (folder / "1.npz").write_bytes(b"no arrays"))
+        for place in (folder, folder / "later"):
+            np.save(place / f"{number}.npy", clip)
+    episodes: list[Any] = [(n, f"task {n}", {"array": c, "function": c[:, :, ::-1]}) for n, c in enumerate(CLIPS)]
+    spoil = lambda: (folder / "later" / "1.npy").write_bytes(b"no arrays")  # noqa: E731
+    return Written(folder, episodes, spoil, more={"reader": f"{file}:episodes"})
 
 
 FORMATS: dict[str, Callable[[Path], Written]] = {
     "LeRobot v2.1": lerobot("toy_v21"),
     "LeRobot v3.0": lerobot("toy_v30_many"),
     "robomimic": robomimic,
-    "ALOHA": of_files(hdf5_writers.write_aloha, task=TASK),
-    "RoboTwin": of_files(robotwin, hdf5_writers.RGB_MARK),
-    "RoboTwin before its mark": of_files(robotwin),
-    "RoboMIND": of_files(hdf5_writers.write_robomind),
-    "ManiSkill": maniskill,
     "IsaacLab-Arena": arena,
     "RLDS": rlds,
     "videos": videos,
     "pictures": pictures,
-    "Unitree": unitree,
-    "arrays": arrays,
+    "pattern": pattern,
+    "reader": reader,
 }
 every_format = pytest.mark.parametrize("write", FORMATS.values(), ids=FORMATS)
 
@@ -188,7 +175,7 @@ every_format = pytest.mark.parametrize("write", FORMATS.values(), ids=FORMATS)
 def written(write: Callable[[Path], Written], folder: Path) -> tuple[Written, Dataset]:
     (folder / "data").mkdir()
     there = write(folder / "data")
-    return there, open_dataset(there.source, task=there.task)
+    return there, there.open()
 
 
 @every_format
@@ -211,7 +198,7 @@ def test_episodes_have_their_numbers_tasks_and_frames(tmp_path: Path, write: Cal
             if camera == "video"
         ]
         assert read in ([], [list(range(length)) for length in LENGTHS])
-    overridden = open_dataset(there.source, task="wave", override_task=True)
+    overridden = there.open(task="wave", override_task=True)
     assert {episode.task for episode in overridden.episodes} == {"wave"}
 
 
@@ -248,7 +235,7 @@ def test_a_camera_is_turned_and_its_colours_swapped_on_request_and_the_recipe_sa
     there, stored = written(write, tmp_path)
     camera, *others = stored.chosen_cameras()
     swapped = "rgb" if stored.corrections.get(camera) else "bgr"  # other than by default
-    dataset = open_dataset(there.source, task=there.task, orient={camera: "rotate90"}, channels={camera: swapped})
+    dataset = there.open(orient={camera: "rotate90"}, channels={camera: swapped})
     episode = stored.episodes[0]
     pixels = np.stack(list(stored.stored_frames(episode, camera)))
     expected = np.rot90(pixels, -1, axes=(1, 2))[..., :: -1 if swapped == "bgr" else 1]
@@ -260,11 +247,12 @@ def test_a_camera_is_turned_and_its_colours_swapped_on_request_and_the_recipe_sa
     with pytest.raises(DatasetError, match=rf"orientations\.{camera}: \w.* there, rotate90 now"):
         label(dataset, BrightnessScorer(), options)
     with pytest.raises(DatasetError, match=rf"orient: expected one of the cameras .*{camera}.*, got 'top'"):
-        open_dataset(there.source, task=there.task, orient={"top": "rotate90"})
+        there.open(orient={"top": "rotate90"})
 
 
 @pytest.mark.parametrize(
-    "write", [FORMATS[name] for name in ("LeRobot v2.1", "robomimic", "videos", "pictures", "Unitree", "arrays")]
+    "write",
+    [FORMATS[name] for name in ("LeRobot v2.1", "robomimic", "videos", "pictures", "pattern", "reader")],
 )
 def test_a_broken_episode_is_named_before_a_score_and_lets_the_others_through(
     tmp_path: Path, output: Path, write: Callable[[Path], Written]
@@ -272,7 +260,7 @@ def test_a_broken_episode_is_named_before_a_score_and_lets_the_others_through(
     there, dataset = written(write, tmp_path)
     assert there.spoil is not None
     there.spoil()
-    dataset, scorer = open_dataset(there.source, task=there.task), BrightnessScorer()
+    dataset, scorer = there.open(), BrightnessScorer()
     numbers_ = [number for number, _, _ in there.episodes]
     options: dict[str, Any] = {"output": output, "frames": 2, "cameras": dataset.chosen_cameras()[-1:]}
     with pytest.raises(RewardError, match=r"--episodes \d"):

@@ -6,14 +6,17 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
+import hdf5_writers
 from in_process import rfm_client
 from labelling import WRIST, BrightnessScorer
 from rfm_client import FrameScores
@@ -128,6 +131,53 @@ def test_outcomes_are_read_from_a_table_the_frames_or_the_episodes(tmp_path: Pat
     assert read_outcomes("success", v21) == {row["episode_index"]: row["success"] for row in rows}
 
 
+def with_column(folder: Path, name: str, value: Callable[[int, bool], Any]) -> Path:
+    """Return a LeRobot dataset with another column. value: of an episode's last frame, or of another one"""
+    root = copied("toy_v21", folder)
+    for file in sorted(root.rglob("data/**/*.parquet")):
+        table = parquet.read_table(file)
+        episode, count = table["episode_index"][0].as_py(), len(table)
+        stored = [value(episode, t == count - 1) for t in range(count)]
+        parquet.write_table(table.append_column(name, pa.array(stored)), file)
+    return root
+
+
+@pytest.mark.parametrize(
+    "value",
+    {
+        "rewards of 1 and 0": lambda episode, end: float(end and episode % 2),
+        "rewards of 0 and -1": lambda episode, end: 0 if end and episode % 2 else -1,
+        "success before the end": lambda episode, end: not end and episode % 2 == 1,
+        "a word in each frame": lambda episode, end: "Success" if episode % 2 else "failure",
+        "lists of one number": lambda episode, end: [episode % 2],
+    }.items(),
+    ids=itemgetter(0),
+)
+def test_outcomes_are_read_as_recorders_write_them(
+    tmp_path: Path, value: tuple[str, Callable[[int, bool], Any]]
+) -> None:
+    root = with_column(tmp_path, "next.reward", value[1])
+    assert read_outcomes("next.reward", root) == {
+        each.index: each.index % 2 == 1 for each in open_dataset(root).episodes
+    }
+
+
+def test_outcomes_of_hdf5_are_attributes_or_arrays(tmp_path: Path) -> None:
+    file = tmp_path / "demos.hdf5"
+    hdf5_writers.write_robomimic(file, [{"front": hdf5_writers.video(3)} for _ in range(3)])
+    with h5py.File(file, "r+") as opened:
+        for number, (label, rewards) in enumerate(
+            [("successful", [0, 0, 1]), ("failure", [0, 0, 0]), ("suboptimal", [])]
+        ):
+            opened[f"data/demo_{number}"].attrs["quality_label"] = label
+            if rewards:
+                opened[f"data/demo_{number}/rewards"] = np.array(rewards, np.float32)
+    for name in ("quality_label", "rewards"):
+        assert read_outcomes(name, file) == {0: True, 1: False, 2: None}
+    with pytest.raises(DatasetError, match=r"outcome: expected .* one of .*quality_label.*rewards.*, got 'reward'"):
+        read_outcomes("reward", file)
+
+
 REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no such column": (
         lambda folder: read_outcomes("succes", copied("toy_v30_many", folder)),
@@ -135,11 +185,11 @@ REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "a column without a dataset": (
         lambda folder: read_outcomes("success", folder),
-        "outcome: expected a CSV file, or a column of a local LeRobot dataset, got 'success'",
+        "outcome: expected a CSV file, a column of a local LeRobot dataset, a name in an HDF5 file, or a reader, got 'suc",
     ),
     "a column of other numbers": (
         lambda folder: read_outcomes("timestamp", copied("toy_v30_many", folder)),
-        r"outcome: timestamp: episode \d: expected true, false, 1 or 0, got ",
+        r"outcome: timestamp: episode \d: expected true, false, 1, 0, success or failure, got ",
     ),
     "other headers": (
         lambda folder: read_outcomes(written(folder / "a.csv", "id,ok\n0,1\n")),
@@ -155,11 +205,11 @@ REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "another word": (
         lambda folder: read_outcomes(written(folder / "a.csv", "episode,success\n0,maybe\n")),
-        r"line 2: success: expected true, false, 1 or 0, got 'maybe'",
+        r"line 2: success: expected true, false, 1, 0, success or failure, got 'maybe'",
     ),
-    "no outcome": (
-        lambda folder: evaluate_labels([labels(folder / "a.parquet", {0: RISING, 1: RISING})], {0: True}),
-        r"outcome: expected one for each labelled episode, got none for episode \[1\]",
+    "rewards that are 0 everywhere": (
+        lambda folder: read_outcomes("next.reward", with_column(folder, "next.reward", lambda episode, end: 0.0)),
+        "outcome: next.reward: expected -1 or 1 in some episode, which shows whether 0 is a failure, got 0 in all",
     ),
     "no common episode": (
         lambda folder: evaluate_labels([labels(folder / f"{n}.parquet", {n: RISING}) for n in range(2)]),
@@ -183,13 +233,13 @@ def test_no_number_is_cut_on_a_terminal_and_episodes_without_an_outcome_are_left
 ) -> None:
     curves = {0: RISING, 1: FALLING, 2: RISING, 3: FLAT, 4: RISING}
     files = [labels(tmp_path / f"{name}_progress.parquet", curves, curves) for name in ("a_long_name_of_a_model", "b")]
-    outcomes = written(tmp_path / "a.csv", "episode,success\n0,1\n1,0\n2,\n3,0\n4,1\n")
+    outcomes = written(tmp_path / "a.csv", "episode,success\n0,1\n1,0\n3,0\n4,1\n")
     for name, value in {"COLUMNS": "80", "FORCE_COLOR": "1"}.items():  # as on a terminal
         monkeypatch.setenv(name, value)
     done = rfm_client("evaluate", tmp_path, "--outcome", outcomes, "--json", tmp_path / "out.json")
     assert done.exit_code == 0, done.output
     shown = re.sub(r"\x1b\[\d*m", "", done.stdout)
-    assert "4 episodes: 2 successes, 2 failures; 1 left out, whose outcome is empty" in shown
+    assert "4 episodes: 2 successes, 2 failures; 1 left out, whose outcome is unknown" in shown
     document = json.loads((tmp_path / "out.json").read_text())
     assert (document["episodes"], document["num_without_outcome"]) == ([0, 1, 3, 4], 1)
     assert max(map(len, shown.partition("VOC: ")[0].splitlines())) <= 80

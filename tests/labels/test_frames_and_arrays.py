@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Episodes as frame folders and arrays, and folders with HDF5 files."""
+"""Episodes as frame folders, folders with HDF5 files, and layouts without a reader."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from PIL import Image
 from hdf5_writers import write_robomimic
 from labelling import LEROBOT, BrightnessScorer, brightness, command
 from paths import ROOT
-from pictures import numbered
+from pictures import numbered, write_video
 from rfm_client.command_line import ExitCode
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset, read_episode_labels
 
@@ -42,18 +42,18 @@ def folders(tmp_path: Path) -> Path:
 def test_a_table_names_folders_their_tasks_and_their_order(folders: Path, column: str) -> None:
     for camera in ("front", "wrist"):
         write_frames(folders / "11" / camera, numbered(3))
-    for t, frame in enumerate(numbered(COUNT)):
-        Image.fromarray(frame[::-1]).save(folders / "2" / f"frame_{t}_left.png")
-    rows = f"10,open the box\n11/front,{TASK}\n2/frame_*_left.png,{TASK}\n"
-    (folders / "tasks.csv").write_text(f"{column},task\n{rows}")
+    (folders / "tasks.csv").write_text(f"{column},task\n10,open the box\n11/front,{TASK}\n")
     dataset = open_dataset(folders)
     assert [(e.name, e.task, e.num_frames) for e in dataset.episodes] == [
         ("10", "open the box", COUNT),
         ("11/front", TASK, 3),
-        ("2/frame_*_left.png", TASK, COUNT),
     ]
-    np.testing.assert_array_equal(list(dataset.frames(dataset.episode(2), "frames")), numbered(COUNT)[:, ::-1])
-    assert dataset.notes == ["tasks.csv: 1 folders of pictures beside it are not listed and get no labels: 0"]
+    assert dataset.notes == ["tasks.csv: 2 folders of pictures beside it are not listed and get no labels: 0, 2"]
+    (folders / "tasks.csv").write_text(f"{column},task\n2/frame_*.png,{TASK}\n")
+    with pytest.raises(
+        DatasetError, match=r"got 2/frame_\*\.png: name the pictures by --videos '{episode}/frame_\*\.png'"
+    ):
+        open_dataset(folders)
 
 
 def depth(root: Path) -> None:
@@ -75,11 +75,11 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "folders of cameras": (
         lambda root: write_frames(root / "3" / "front", numbered(2)),
-        "3: expected PNG or JPEG files, got the folders front: list the folders of one camera in tasks.csv (3/front)",
+        "3: expected PNG or JPEG files, got the folders front: if they are cameras, --videos '{episode}/{camera}/*.png' names",
     ),
     "two formats": (
         lambda root: Image.fromarray(numbered(1)[0]).save(root / "2" / "x.jpg"),
-        "got x.jpg (1) and frame_*.png (12): list those of one camera in tasks.csv, as 2/x.jpg",
+        "got frame_*.png (12) and x.jpg (1): name the frame's number and the camera, as --videos '{episode}/frame_*.png'",
     ),
     "no picture": (
         lambda root: (root / "2" / "frame_1.png").write_bytes(b"x"),
@@ -101,40 +101,26 @@ def test_a_folder_without_frames_is_refused_before_a_score(
     assert scorer.num_samples == 0
 
 
-UNREADABLE: dict[str, tuple[Any, str]] = {
-    "embeddings": (np.zeros((3, 8), np.float32), r"frames, uint8 \[T, H, W, 3\], got embeddings: score them with"),
-    "grey pictures": (np.zeros((3, 8, 8), np.uint8), r"a\.npy: .*expected .*\[T, H, W, 3\]"),
-    "objects": (np.array([{}]), r"a\.npy: file: expected arrays of numbers and text, none pickled"),
-}
-
-
-@pytest.mark.parametrize(("array", "message"), UNREADABLE.values(), ids=UNREADABLE)
-def test_arrays_that_are_no_frames_are_refused(tmp_path: Path, array: Any, message: str) -> None:
-    np.save(tmp_path / "a.npy", array)
-    with pytest.raises(DatasetError, match=message):
-        _ = open_dataset(tmp_path, task=TASK).episodes
-
-
 def test_a_table_lists_episodes_of_one_kind(folders: Path) -> None:
-    np.save(folders / "a.npy", numbered(2))
-    (folders / "tasks.csv").write_text(f"video,task\n0,{TASK}\na.npy,{TASK}\n")
+    write_video(folders / "a.mp4", numbered(2))
+    (folders / "tasks.csv").write_text(f"video,task\n0,{TASK}\na.mp4,{TASK}\n")
     with pytest.raises(
-        DatasetError, match=r"got arrays \(a\.npy\) and folders of pictures \(0\): write a table for each"
+        DatasetError, match=r"got folders of pictures \(0\) and videos \(a\.mp4\): write a table for each"
     ):
         open_dataset(folders)
 
 
 def test_a_file_whose_name_looks_like_a_pattern_is_a_file(tmp_path: Path) -> None:
-    np.save(tmp_path / "a*b.npy", numbered(2))
+    write_video(tmp_path / "a*b.mp4", numbered(2))
     (tmp_path / "a*b.txt").touch()
     for task in (TASK, None):
         dataset = open_dataset(tmp_path, task=task)
-        assert ([episode.name for episode in dataset.episodes], *dataset.notes) == (["a*b.npy"],)
-        (tmp_path / "tasks.csv").write_text(f"video,task\na*b.npy,{TASK}\n")
+        assert ([episode.name for episode in dataset.episodes], *dataset.notes) == (["a*b.mp4"],)
+        (tmp_path / "tasks.csv").write_text(f"video,task\na*b.mp4,{TASK}\n")
 
 
 def test_a_table_of_before_is_refused_also_with_a_task_for_all(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", numbered(2))
+    write_video(tmp_path / "a.mp4", numbered(2))
     (tmp_path / "tasks.json").touch()
     with pytest.raises(DatasetError, match=r"expected tasks\.csv .*, got tasks\.json: write it as tasks\.csv"):
         open_dataset(tmp_path, task=TASK)
@@ -190,26 +176,27 @@ def test_a_folder_of_hdf5_files_is_refused_before_a_score(tmp_path: Path, labels
 
 UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, the opened path, the end of the message
     "TFRecord files alone": (["1.0.0/a.tfrecord-00000-of-00001"], "1.0.0", "got TFRecord files without features.json"),
-    "Zarr": ([".zgroup", "data/.zgroup"], "", "got Zarr arrays: convert them to LeRobot, or"),
-    "Zarr in an archive": (["buffer.zarr.zip"], "buffer.zarr.zip", "got Zarr arrays: convert them to LeRobot, or"),
-    "a rosbag of ROS 2": (["metadata.yaml", "a_0.db3"], "", "got a rosbag: convert them to LeRobot, or"),
-    "a rosbag of ROS 1": (["a.bag"], "a.bag", "got a rosbag: convert them to LeRobot, or"),
-    "MCAP files": (["a.mcap", "b.mcap"], "", "got a rosbag: convert them to LeRobot, or"),
+    "Zarr": ([".zgroup", "data/.zgroup"], "", "got Zarr arrays: write a reader of ten lines (--reader"),
+    "Zarr in an archive": (
+        ["buffer.zarr.zip"],
+        "buffer.zarr.zip",
+        "got Zarr arrays: write a reader of ten lines (--reader",
+    ),
+    "a rosbag of ROS 2": (["metadata.yaml", "a_0.db3"], "", "got a rosbag: write a reader of ten lines (--reader"),
+    "a rosbag of ROS 1": (["a.bag"], "a.bag", "got a rosbag: write a reader of ten lines (--reader"),
+    "MCAP files": (["a.mcap", "b.mcap"], "", "got a rosbag: write a reader of ten lines (--reader"),
     "LeRobot v1": (["meta_data/info.json"], "", "got a LeRobot dataset of v1: convert it to v2.0 with LeRobot 0.3"),
     "HDF5 files in folders": (["a/x.hdf5"], "", "each a dataset of its own: rfm-client label takes the folder, open_"),
     "pictures": (["1.png", "2.png"], "", "got pictures outside of the folder of an episode"),
-    "pictures of cameras": (["a/front/1.jpg"], "", "list the folders of one camera (a/front) in tasks.csv"),
-    "videos of an episode each": (
-        ["a/b/episode_000000.mp4"],
-        "",
-        "list the videos of one camera (a/b/episode_000000.mp4) in tasks.csv",
-    ),
+    "pictures of cameras": (["a/front/1.jpg"], "", "perhaps --videos '{episode}/front/*.jpg'; or write a reader"),
+    "a video in a deeper folder": (["a/b/episode_000000.mp4"], "", "perhaps --videos '{episode}.mp4'; or write"),
     "pictures and a video": (
         ["0/1.png", "a.mp4"],
         "",
         "got videos (a.mp4) and folders of pictures (0): list the episodes of one kind in tasks.csv",
     ),
-    "HDF5 files and arrays": (["a.hdf5", "a.npy"], "", "of one kind, got arrays (a.npy) and HDF5 files (a.hdf5): list"),
+    "HDF5 files and videos": (["a.hdf5", "a.mp4"], "", "of one kind, got videos (a.mp4) and HDF5 files (a.hdf5): list"),
+    "arrays": (["a.npz"], "", "each episode in it, or write a reader of ten lines (--reader; examples/readers)"),
     "pictures beside folders": (
         ["0/1.png", "1.png"],
         "",
@@ -231,8 +218,8 @@ UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, the opened path, the
         "",
         "got tasks.json: write it as tasks.csv, with the columns video and",
     ),
-    "an empty folder": ([".hidden"], "", "got an empty folder: put a video, an array or a folder of pictures for each"),
-    "other files": (["a.txt"], "", "got other files: put a video, an array or a folder of pictures for each episode"),
+    "an empty folder": ([".hidden"], "", "got an empty folder: put a video or a folder of pictures for each"),
+    "other files": (["a.txt"], "", "got other files: put a video or a folder of pictures for each episode"),
     "another file": (["a.txt"], "a.txt", "or a Hub id org/name[@revision], got another file"),
 }
 
@@ -245,7 +232,6 @@ CLONED: dict[str, tuple[Path | None, str]] = {  # a copied dataset, and its file
     "records": (ROOT / "tests/rlds/toy_steps_texts/1.0.0", "toy_steps_texts-train.tfrecord-00000-of-00002"),
     "an HDF5 file": (None, "a.hdf5"),
     "a picture": (None, "0/1.png"),
-    "arrays": (None, "a.npy"),
 }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from pyarrow import parquet
 
 import hdf5_writers as writers
 from client_commands import invoke
-from hdf5_writers import RGB_MARK, TASK, decoded, jpeg, video
+from hdf5_writers import TASK
 from labelling import BrightnessScorer, Notes
 from rfm_client import FrameSize, InvalidSampleError, ProgressResult, ProgressSample
 from rfm_client.frames import Correction, resize_frames
@@ -151,7 +151,7 @@ def test_a_picture_that_is_no_8_bit_colours_or_not_in_all_demonstrations_is_left
     assert str(refused.value) == f"cameras: expected some of {BOTH}, got 'other', which is left out: {reason}"
     with pytest.raises(DatasetError) as refused:
         open_dataset(write(file, LIBERO, {"other": value, **numbers}))
-    form = "a camera as uint8 [T, H, W, 3] in every demonstration"
+    form = "a camera as uint8 [T, H, W, 3] in every episode"
     assert str(refused.value) == f"{file}: data/demo_0/obs: expected {form}, got other: {reason}"
     write(file, LIBERO, pictures(), pictures(other=FRAMES))
     assert open_dataset(file).left_out == {"other": "missing in demo_0"}
@@ -383,117 +383,17 @@ def test_notes_list_omitted_parts_and_the_rest_is_labelled(
     assert [line for line in notes.lines if not line.startswith(settings)] == lines
 
 
-# Files of one episode
-
-
-FILES = {name: [jpeg(frame) for frame in video(6, seed)] for seed, name in enumerate(("high", "left"))}
-SWAPPED = [jpeg(frame[..., ::-1]) for frame in video(6)]
-MARKED = [jpeg(frame, RGB_MARK) for frame in video(6)]
-
-
-def test_the_caller_s_order_of_colours_goes_before_that_of_robotwin(tmp_path: Path) -> None:
-    file = writers.write_robotwin(tmp_path, {"head_camera": SWAPPED})
-    assert (
-        "channels: head_camera bgr (RoboTwin's JPEG files without its mark of RGB, from before September 2026, store "
-        "red as blue; --channels rgb leaves them)"
-    ) in open_dataset(file).notes
-    for given in ("rgb", {"head_camera": "rgb"}):
-        dataset = open_dataset(file, channels=given)  # type: ignore[arg-type]
-        assert not any(note.startswith("channels: ") for note in dataset.notes)
-        assert not dataset.corrections
-
-
-HIGH = FILES["high"]
-BROKEN: dict[str, tuple[Sequence[bytes], str]] = {
-    "cut off, with zeros behind": (
-        [*HIGH[:3], HIGH[3][:-100], *HIGH[4:]],
-        "frame 3: expected a whole JPEG file, got o",
-    ),
-    "no picture": ([b"no picture", *HIGH[1:]], "frame 0: expected an image, got "),
-    "empty": ([*HIGH[:3], b"", *HIGH[4:]], "frame 3: expected an image, got "),
-    "another size": (
-        [*HIGH[:4], jpeg(video(1)[0, :40]), HIGH[5]],
-        "frame 4: expected a frame of 48 x 64 pixels, as the first, got 40 x 64 pixels",
-    ),
-    "with and without RoboTwin's mark": (
-        [*MARKED[:3], *HIGH[3:]],
-        "expected JPEG files all with RoboTwin's mark of RGB",
-    ),
-}
-
-
-@pytest.mark.parametrize(("stored", "message"), BROKEN.values(), ids=BROKEN)
-def test_broken_files_of_frames_are_an_error_with_file_camera_and_frame(
-    tmp_path: Path, stored: Sequence[bytes], message: str
-) -> None:
-    file = writers.write_aloha(tmp_path / "episode_0.hdf5", {**FILES, "left": list(stored)}, task=TASK)
-    dataset, faults = open_dataset(file), list[str]()
-    for read in (dataset.check, lambda *of: list(dataset.frames(*of))):
-        try:
-            read(dataset.episodes[0], "left")
-        except DatasetError as fault:
-            faults.append(str(fault))
-    assert len(faults) == (
-        1 if "a frame of" in message or "mark" in message else 2
-    )  # found by decoding alone, and by the check alone
-    assert all(fault.startswith(f"{file}: observations/images/left: {message}") for fault in faults)
-
-
-def test_an_episode_of_pixels_alone_has_a_size_of_robomind_s_and_blue_first(tmp_path: Path) -> None:
-    frames = np.random.default_rng(5).integers(0, 256, (2, 480, 640, 3), np.uint8)
-    cameras = {"top": [frame.tobytes() for frame in frames], "left": [b"x"] * 2}
-    dataset = open_dataset(writers.write_robomind(tmp_path / "trajectory.hdf5", cameras))
-    dataset.check(dataset.episodes[0], "top")
-    np.testing.assert_array_equal(list(dataset.frames(dataset.episodes[0], "top")), frames[..., ::-1])
-    with pytest.raises(DatasetError, match="left: frame 0: expected an image, got "):
-        list(dataset.frames(dataset.episodes[0], "left"))
-
-
-PLACES: dict[str, tuple[Callable[[Any], object], str | None]] = {
-    "an attribute": (told("/", "instruction", np.bytes_(TASK)), None),
-    "a dataset": (put("language_raw", np.array([TASK], h5py.string_dtype())), None),
-    "several sentences": (
-        put("language_raw", np.array([TASK, "another"], h5py.string_dtype())),
-        r"expected a task as a sentence, got .*another",
-    ),
-    "none": (
-        lambda _: None,
-        "attribute or dataset language_instruction, instruction, task, language_raw, or RoboTwin's instructions/episode0",
-    ),
-}
-
-
-@pytest.mark.parametrize(("change", "message"), PLACES.values(), ids=PLACES)
-def test_the_task_of_a_file_of_one_episode(
-    tmp_path: Path, change: Callable[[Any], object], message: str | None
-) -> None:
-    writers.write_robotwin(tmp_path, {"head_camera": MARKED})  # whose sentences are not those of another layout
-    file = writers.write_aloha(tmp_path / "data/episode0.hdf5", {"high": video(6)})
-    changed(file, change)
-    if message is None:
-        assert open_dataset(file).episodes[0].task == TASK
-        return
+def test_another_layout_is_refused_with_the_readers_that_open_others(tmp_path: Path) -> None:
+    file = writers.write_aloha(tmp_path / "other.hdf5", {"high": FRAMES})
+    message = "data: expected demo_0, demo_1 and so on, got none: the file holds action, observations; a reader opens"
     with pytest.raises(DatasetError, match=message):
-        _ = open_dataset(file).episodes
-    assert open_dataset(file, task=TASK, override_task=True).episodes[0].task == TASK
-
-
-def test_the_task_of_robotwin_is_the_first_sentence_of_its_side_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = writers.write_robotwin(tmp_path, {"head_camera": MARKED})
-    monkeypatch.chdir(file.parent)
-    assert open_dataset(file.name).episodes[0].task == TASK
-    assert "task: the first of 3 sentences in instructions/episode0.json" in open_dataset(file).notes
-    (tmp_path / "instructions/episode0.json").write_text("[")
-    with pytest.raises(DatasetError, match=r'episode0\.json: expected a JSON object \{"seen": \[sentences\]\}'):
         open_dataset(file)
 
 
-def test_robomimics_layout_may_hold_files_too(tmp_path: Path) -> None:
-    file = tmp_path / "demos.hdf5"
-    with h5py.File(file, "w") as stored:
-        frames = stored.create_dataset("data/demo_0/obs/front", (6,), dtype=h5py.vlen_dtype(np.uint8))
-        frames[:] = [np.frombuffer(each, np.uint8) for each in HIGH]
-    dataset = open_dataset(file, task=TASK)
-    np.testing.assert_array_equal(list(dataset.frames(dataset.episodes[0], "front")), [decoded(each) for each in HIGH])
+def test_a_camera_of_picture_files_is_left_out_with_the_reader_that_decodes_them(three: Path) -> None:
+    files = np.stack([np.frombuffer(writers.jpeg(frame).ljust(2000, b"\0"), np.uint8) for frame in FRAMES])
+    dataset = open_dataset(changed(three, put("data/demo_1/obs/wrist", files)))
+    assert dataset.left_out == {"wrist": "missing in demo_0"}
+    for number in (0, 2):
+        changed(three, put(f"data/demo_{number}/obs/wrist", files))
+    assert open_dataset(three).left_out["wrist"].startswith("JPEG or PNG files: a reader decodes them (--reader")

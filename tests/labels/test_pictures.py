@@ -16,7 +16,7 @@ from PIL import Image, ImageOps, PngImagePlugin
 from pictures import numbered, numbers
 from rfm_client import UInt8Array
 from rfm_labels import DatasetError, open_dataset
-from rfm_labels.datasets.folders import in_order_of_numbers
+from rfm_labels.datasets.pictures_in_order import in_order_of_numbers
 from rfm_labels.datasets.stored_files import digest_of, file_identity
 
 TASK = "stack the cups"
@@ -73,23 +73,31 @@ def of_cameras(pattern: str, cameras: Sequence[object], count: int = 3) -> list[
 
 
 SEVERAL = "expected pictures of one camera, whose names differ in a number, got "
-SEVERAL_KINDS = {
-    "words before": (of_cameras("{camera}_{t:04d}.png", ("left", "right")), "left_*.png (3) and right_*.png (3)"),
-    "colours and depths": (of_cameras("{camera}_{t}.png", ("depth", "rgb")), "rgb_*.png (3) and depth_*.png (3)"),
-    "masks": (of_cameras("{t:04d}{camera}.png", ("", "_mask")), "*.png (3) and *_mask.png (3)"),
-    "a copy of a browser": ([*of_cameras("{t}.png", ("",)), "1 (1).png"], "*.png (3) and * (*).png (1)"),
-    "a picture of the goal": ([*of_cameras("{t}.png", ("",)), "goal.png"], "*.png (3) and goal.png (1)"),
-    "numbers of cameras": (of_cameras("cam{camera}_{t}.png", (0, 1))[:-1], "cam0_*.png (3) and cam1_*.png (2)"),
-    "numbers of cameras behind": (of_cameras("{t}_cam{camera}.png", (0, 1)), "*_cam0.png (3) and *_cam1.png (3)"),
-    "a grid of numbers": (of_cameras("{t:04d}_{camera}.png", (1, 2)), "*_1.png (3) and *_2.png (3)"),
+SEVERAL_KINDS = {  # names, what is told, the pattern
+    "words before": (
+        of_cameras("{camera}_{t:04d}.png", ("left", "right")),
+        "left_*.png (3) and right_*.png (3)",
+        "{camera}_*.png",
+    ),
+    "colours and depths": (
+        of_cameras("{camera}_{t}.png", ("depth", "rgb")),
+        "depth_*.png (3) and rgb_*.png (3)",
+        "{camera}_*.png",
+    ),
+    "masks": (of_cameras("{t:04d}{camera}.png", ("", "_mask")), "*.png (3) and *_mask.png (3)", "*.png"),
+    "a copy of a browser": ([*of_cameras("{t}.png", ("",)), "1 (1).png"], "*.png (3) and * (*).png (1)", "*.png"),
+    "a picture of the goal": ([*of_cameras("{t}.png", ("",)), "goal.png"], "*.png (3) and goal.png (1)", "*.png"),
+    "numbers of cameras": (of_cameras("cam{camera}_{t}.png", (0, 1))[:-1], "cam*_*.png (5)", "{camera}_*.png"),
+    "numbers of cameras behind": (of_cameras("{t}_cam{camera}.png", (0, 1)), "*_cam*.png (6)", "*_{camera}.png"),
+    "a grid of numbers": (of_cameras("{t:04d}_{camera}.png", (1, 2)), "*_*.png (6)", "*_{camera}.png"),
 }
 
 
-@pytest.mark.parametrize(("names", "told"), SEVERAL_KINDS.values(), ids=SEVERAL_KINDS)
-def test_several_kinds_of_names_are_refused(tmp_path: Path, names: Sequence[str], told: str) -> None:
+@pytest.mark.parametrize(("names", "told", "pattern"), SEVERAL_KINDS.values(), ids=SEVERAL_KINDS)
+def test_several_kinds_of_names_are_refused(tmp_path: Path, names: Sequence[str], told: str, pattern: str) -> None:
     with pytest.raises(DatasetError) as refused:
         in_order_of_numbers(tmp_path, names)
-    remedy = f"list those of one camera in tasks.csv, as {tmp_path.name}/{told.partition(' (')[0]}"
+    remedy = f"name the frame's number and the camera, as --videos '{{episode}}/{pattern}'"
     assert str(refused.value) == f"{tmp_path}: {SEVERAL}{told}: {remedy}"
 
 

@@ -11,6 +11,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from paths import ROOT
 from rfm_client.frames import read_video
 from rfm_client.options import ConfigError
 from rfm_labels import LabelOptions, label, open_dataset, read_episode_labels
-from rfm_labels.datasets import LeRobotDataset
+from rfm_labels.datasets import LeRobotDataset, open_to_show
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew, hdf5
 
 V21, V30 = range(2)  # datasets with labels; one without follows
@@ -51,7 +52,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 @contextmanager
-def serving(*roots: Path, **settings: Any) -> Iterator[Get]:
+def serving(*roots: Path | str, **settings: Any) -> Iterator[Get]:
     """Run a gateway that shows the datasets in these folders. Yields a function that asks it."""
     with inside(dataset=tuple(map(str, roots)), **settings) as gateway:
         yield lambda path: gateway.get(f"/viewer/datasets{path}")
@@ -134,10 +135,33 @@ def with_pictures_in_tables(folder: Path) -> Path:
     return root
 
 
-@pytest.mark.parametrize("make", [rlds, with_pictures_in_tables, hdf5])
-def test_pictures_are_shown_as_a_video(tmp_path: Path, make: Callable[[Path], Path]) -> None:
+def by_pattern(folder: Path) -> str:
+    for number, place in product(range(2), ("left", "right")):
+        (folder / "recordings" / f"{number}" / place).mkdir(parents=True)
+        for t, frame in enumerate(writers.video(4, seed=number)):
+            Image.fromarray(frame).save(folder / "recordings" / f"{number}" / place / f"{t}.png")
+    return f"{{episode}}/{{camera}}/*.png={folder}/recordings"
+
+
+def by_reader(folder: Path) -> str:
+    for number in range(2):
+        np.save(folder / f"{number}.npy", writers.video(4, seed=number))
+    reader = """
+import numpy as np
+from rfm_labels import Episode
+
+def episodes(folder):
+    for file in sorted(folder.glob("*.npy")):
+        yield Episode(file.stem, {"front": np.load(file)}, fps=10)
+"""
+    (folder / "my_reader.py").write_text(reader)
+    return f"{folder}/my_reader.py:episodes={folder}"
+
+
+@pytest.mark.parametrize("make", [rlds, with_pictures_in_tables, hdf5, by_pattern, by_reader])
+def test_pictures_are_shown_as_a_video(tmp_path: Path, make: Callable[[Path], Path | str]) -> None:
     root = make(tmp_path)
-    dataset = open_dataset(root)
+    dataset = open_to_show(str(root))
     number, camera = dataset.numbers[1], len(dataset.cameras) - 1
     with serving(root) as get:
         table, curves = get("/0").json(), get(f"/0/episodes/{number}").json()
@@ -318,10 +342,12 @@ def test_a_dataset_that_breaks_says_why(
 
 
 def test_a_frame_of_another_size_is_refused_not_stretched(tmp_path: Path) -> None:
-    frames = [writers.jpeg(frame) for frame in (*writers.video(3), writers.video(1)[0, :40])]
-    with serving(writers.write_aloha(tmp_path / "demos.hdf5", {"high": frames})) as get:
+    (tmp_path / "demos" / "0").mkdir(parents=True)
+    for t, frame in enumerate((*writers.video(3), writers.video(1)[0, :40])):
+        Image.fromarray(frame).save(tmp_path / "demos" / "0" / f"{t}.png")
+    with serving(tmp_path / "demos") as get:
         told = failure(get("/0/episodes/0/videos/0"), 500)
-    assert "high: frame 3: expected a frame of 48 x 64 pixels, as the first, got 40 x 64 pixels" in told
+    assert "0: frames: frame 3: expected a frame of 48 x 64 pixels, as the first, got 40 x 64 pixels" in told
 
 
 def test_labels_that_come_or_change_are_shown_at_once(tmp_path: Path) -> None:

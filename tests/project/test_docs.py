@@ -21,6 +21,7 @@ import httpx
 import numpy as np
 import pytest
 from click import Command, Context
+from PIL import Image
 from typer.main import get_command
 
 import clip
@@ -38,6 +39,7 @@ pytestmark = pytest.mark.triton
 
 DOCS = ROOT / "docs"
 CLIENT_GUIDE = DOCS / "guides" / "use_the_client.md"
+READER_GUIDE = DOCS / "guides" / "label_whatever_you_recorded.md"
 CONTRACT = DOCS / "reference" / "contract.md"
 ARCHITECTURE = DOCS / "explanation" / "architecture.md"
 GUIDES = sorted([*DOCS.glob("guides/*.md"), *DOCS.glob("tutorials/*.md")])
@@ -95,9 +97,15 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "outcomes.csv").write_text(f"episode,success\n{outcomes}")
     toy_dataset.write(tmp_path / "demo_output" / "toy", clips=2)
     hdf5_writers.write_robomimic(tmp_path / "demos.hdf5", [{"front": hdf5_writers.video(4)}])
-    hdf5_writers.write_aloha(tmp_path / "aloha_folder" / "episode_0.hdf5", {"top": hdf5_writers.video(4)})
-    maniskill = tmp_path / "trajectory.rgb.pd_ee_delta_pose.physx_cpu.h5"
-    hdf5_writers.write_maniskill(maniskill, {0: {"base_camera": hdf5_writers.video(4)}})
+    (tmp_path / "recordings" / "0" / "videos").mkdir(parents=True)
+    (tmp_path / "recordings" / "0" / "colors").mkdir()
+    clip.write(tmp_path / "recordings" / "0" / "videos" / "front.mp4")
+    for t, frame in enumerate(pictures(7)):
+        Image.fromarray(frame).save(tmp_path / "recordings" / "0" / "colors" / f"{t}_front.jpg")
+    np.savez(tmp_path / "recordings" / "0.npz", frames=pictures(8), goal="stack the cups", success=True)
+    (tmp_path / "recordings" / "tasks.csv").write_text("episode,task\n0,stack the cups\n")
+    (reader,) = re.findall(r"^```python\n(# my_reader\.py.*?)^```", READER_GUIDE.read_text(), re.MULTILINE | re.DOTALL)
+    (tmp_path / "my_reader.py").write_text(reader)
     np.savez(tmp_path / "episode.npz", frames=pictures(0), task="stack the cups")
     monkeypatch.chdir(tmp_path)
     return tmp_path

@@ -105,6 +105,7 @@ def command(
     say: Callable[[str], None] = print,
     *,
     task: str | None = None,
+    reader: str | None = None,
     **run: bool,
 ) -> int:
     """Run ``rfm-client label`` with a scorer instead of a server. Return the exit code.
@@ -113,7 +114,7 @@ def command(
     """
     from rfm_labels.commands.label import EpisodeTexts, LabelCommand, RunOptions
 
-    texts, options = EpisodeTexts(task=task), RunOptions(**run)
+    texts, options = EpisodeTexts(task=task, reader=reader), RunOptions(**run)
     return LabelCommand(str(source), texts, labels, options, RayOptions(), lambda: nullcontext(scorer), say).run()
 
 

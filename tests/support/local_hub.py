@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from unittest import mock
-from urllib.parse import unquote
+from urllib.parse import parse_qs, unquote
 
 from servers import Quiet, web_server
 
@@ -72,13 +72,21 @@ def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") ->
 
         do_HEAD = do_GET  # noqa: N815  the name that http.server asks for
 
+        def do_POST(self) -> None:
+            """Answer a request for the sizes of named files, the only POST that is served."""
+            asked = parse_qs(self.rfile.read(int(self.headers["Content-Length"])).decode())["paths"]
+            repository, _, revision = self.path.removeprefix(f"/api/{kind}/").partition("/paths-info/")
+            folder = next(each for name, each in repositories[repository].items() if commit_of(name) == revision)
+            files = [file for name in asked if (file := folder / name).is_file()]
+            self._send(200, json.dumps([_told(file, folder) for file in files]).encode())
+
         def _send(self, status: int, body: bytes, headers: Mapping[str, str] | None = None) -> None:
             self.send_response(status)
             for name, value in (headers or {}).items():
                 self.send_header(name, value)
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
-            if self.command == "GET":
+            if self.command != "HEAD":
                 self.wfile.write(body)
 
     with web_server(Handler) as url:

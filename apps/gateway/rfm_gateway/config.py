@@ -45,7 +45,9 @@ class GatewayConfig(Settings):
     metrics_url: str | None = setting(None, "URL of Triton's metrics. Default: those of the Triton beside it.")
     model: str | None = setting(None, "Model name in the repository. Default: rfm, or export.name.")
     viewer: bool = setting(True, "Serve the page in the browser, at /.")
-    dataset: tuple[str, ...] = setting((), "LeRobot or RLDS folder or HDF5 file to show on the page. Repeat for more.")
+    dataset: tuple[str, ...] = setting(
+        (), "Dataset to show on the page: a path, PATTERN=FOLDER or READER=FOLDER. Repeat for more."
+    )
     api_key_file: Path | None = setting(None, f"File with the API key that requests need. Default: {KEY_VARIABLE}.")
     cors_origin: tuple[str, ...] = setting((), "Web origin that may send requests. Repeat for more.")
     allow_host: tuple[str, ...] = setting((), "Host name that callers without a key may use. Repeat for more.")

@@ -9,12 +9,14 @@ with RewardClient("grpc://localhost:8001") as client:
 """
 
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, iter_episodes
+from rfm_labels.datasets.episodes import Episode
 from rfm_labels.datasets.faults import DatasetError
 from rfm_labels.datasets.opening import open_dataset
-from rfm_labels.evaluation import Evaluation, LabelComparison, evaluate_labels, read_outcomes
+from rfm_labels.evaluation import Evaluation, LabelComparison, evaluate_labels
 from rfm_labels.label_files import Curve, EpisodeLabels, find_label_files, read_episode_labels, read_provenance
 from rfm_labels.labelling import Report, label
 from rfm_labels.options import LabelOptions, RayOptions, Watch, parse_episodes
+from rfm_labels.outcomes import read_outcomes
 from rfm_labels.ray_engine import label_with_ray
 from rfm_labels.scorer import CheckpointFacts, ClientScorer, Scorer
 from rfm_labels.summary import Summary, summarise
@@ -26,6 +28,7 @@ __all__ = [
     "Dataset",
     "DatasetEpisode",
     "DatasetError",
+    "Episode",
     "EpisodeLabels",
     "Evaluation",
     "LabelComparison",

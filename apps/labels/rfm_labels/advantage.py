@@ -40,4 +40,5 @@ def recap_advantages(progress: Float32Array, horizon: int, steps: int) -> Float3
     now = np.arange(len(progress))
     later = np.minimum(now + horizon, len(progress) - 1)
     values = progress.astype(np.float64)
-    return (values[later] - values[now] - (later - now) / steps).astype(np.float32)
+    advantages: Float32Array = (values[later] - values[now] - (later - now) / steps).astype(np.float32)
+    return advantages

@@ -8,7 +8,6 @@ VOC is 1.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,17 +16,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_labels.datasets.faults import DatasetError, require
-from rfm_labels.datasets.lerobot_meta import EPISODES_FILE, column_types, json_lines, read_table
+from rfm_labels.datasets.faults import require
 from rfm_labels.label_files import read_label_table, reward_name
 from rfm_labels.metadata import PROGRESS, SUCCESS
 from rfm_labels.summary import BACKWARDS_BY, voted_success
 
 Floats = npt.NDArray[np.floating[Any]]
 
-_OUTCOMES = {"1": True, "0": False, "true": True, "false": False, "1.0": True, "0.0": False}
-_UNKNOWN = ("", "nan")
-_EPISODE, _SUCCESS = "episode", "success"  # columns in an outcomes CSV
 _ROUNDING = 1e-12  # tolerance when comparing balanced accuracies
 
 
@@ -83,7 +78,7 @@ class LabelComparison:
     episodes: numbers of the shared episodes
     is_success: bool [E]; None: outcomes are unknown
     num_left_out: episodes that only some files have
-    num_without_outcome: shared episodes left out because their outcome is None
+    num_without_outcome: shared episodes left out because their outcome is unknown
     """
 
     evaluations: Sequence[Evaluation]
@@ -104,9 +99,9 @@ class _Scores:
 def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool | None] | None = None) -> LabelComparison:
     """Return an evaluation of label files for one dataset.
 
-    outcomes: by episode number: True for success, None to leave the episode out; None: unknown
+    outcomes: by episode number: True for success; None, or no entry, to leave the episode out; None: unknown
 
-    Raises DatasetError if a file is unreadable, the files share no episode, or an episode lacks an outcome.
+    Raises DatasetError if a file is unreadable, the files share no episode, or no episode has an outcome.
     """
     require("labels", len(files) > 0, "at least one file", "none")
     names = _names(files)
@@ -116,70 +111,11 @@ def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool | None] |
     require("labels", len(common) > 0, "an episode that all files have", "none")
     in_all = len(common)
     if outcomes is not None:
-        missing = [episode for episode in common if episode not in outcomes]
-        require("outcome", not missing, "one for each labelled episode", f"none for episode {missing[:1]}")
-        common = [episode for episode in common if outcomes[episode] is not None]
+        common = [episode for episode in common if outcomes.get(episode) is not None]
         require("outcome", len(common) > 0, "one that is known", f"none for {in_all} episodes")
     is_success = None if outcomes is None else np.array([outcomes[episode] for episode in common])
     evaluations = [_evaluation(name, [read[name][each] for each in common], is_success) for name in names]
     return LabelComparison(evaluations, common, is_success, len(everywhere) - in_all, in_all - len(common))
-
-
-def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool | None]:
-    """Return each episode's outcome by number; None for null, NaN or an empty cell. Raises DatasetError.
-
-    source: a CSV file with the columns ``episode`` and ``success``, or a LeRobot column: per frame, where the last
-        value counts, or per episode. Values: true, false, 1 or 0
-    dataset: the LeRobot dataset's folder
-    """
-    if Path(source).suffix.lower() == ".csv":
-        return _of_csv(Path(source))
-    if dataset is None or not (dataset / "meta").is_dir():
-        raise DatasetError.at("outcome", "a CSV file, or a column of a local LeRobot dataset", repr(source))
-    frames, episodes = (
-        sorted(dataset.glob(pattern)) for pattern in ("data/**/*.parquet", "meta/episodes/**/*.parquet")
-    )
-    columns = [list(column_types(files[0])) if files else [] for files in (frames, episodes)]
-    for files, names in zip((frames, episodes), columns, strict=True):
-        if source in names:
-            table = [read_table(file, ["episode_index", source]).to_pydict() for file in files]
-            rows = [row for part in table for row in zip(part["episode_index"], part[source], strict=True)]
-            return {
-                index: _outcome(f"outcome: {source}: episode {index}", value) for index, value in dict(rows).items()
-            }
-    file = dataset / EPISODES_FILE
-    lines = list(json_lines(file)) if file.is_file() else []
-    if not lines or source not in lines[0][1]:
-        known = ", ".join(columns[0])
-        raise DatasetError.at("outcome", f"a CSV file, or a column of {dataset}: {known}", repr(source))
-    return {line["episode_index"]: _outcome(f"{where}: {source}", line.get(source)) for where, line in lines}
-
-
-def _of_csv(file: Path) -> dict[int, bool | None]:
-    try:
-        with file.open(newline="", encoding="utf-8-sig") as content:
-            rows = list(csv.DictReader(content))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DatasetError.at(file, "a CSV file", error) from error
-    got = ", ".join(rows[0]) if rows else "no rows"
-    require(file, bool(rows) and {_EPISODE, _SUCCESS} <= rows[0].keys(), f"the columns {_EPISODE} and {_SUCCESS}", got)
-    outcomes: dict[int, bool | None] = {}
-    for number, row in enumerate(rows, 2):
-        where, text = f"{file}: line {number}", (row[_EPISODE] or "").strip()
-        require(f"{where}: {_EPISODE}", text.isdecimal(), "the number of an episode", repr(text))
-        require(where, int(text) not in outcomes, "each episode once", f"{text} again")
-        outcomes[int(text)] = _outcome(f"{where}: {_SUCCESS}", row[_SUCCESS])
-    return outcomes
-
-
-def _outcome(where: str, value: Any) -> bool | None:
-    while isinstance(value, list) and len(value) == 1:
-        (value,) = value
-    text = "" if value is None else str(value).strip().lower()
-    if text in _UNKNOWN:
-        return None
-    require(where, text in _OUTCOMES, "true, false, 1 or 0", repr(value))
-    return _OUTCOMES[text]
 
 
 def _names(files: Sequence[Path]) -> list[str]:

@@ -31,6 +31,9 @@ class Watch:
     def note(self, text: str) -> None:
         """Receive a line for the user: a decision, or a warning."""
 
+    def downloading(self, num_files: int, num_bytes: int) -> None:
+        """Called before files of a Hub dataset are downloaded. An error prevents the download."""
+
     def checking(self, num_episodes: int) -> None:
         """Called before all episodes are checked."""
 

@@ -349,6 +349,7 @@ def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: 
     Raises DatasetError, RewardError if the scorer does not answer, ValueError if the sampling rule needs a frame count.
     """
     recipe = Recipe.of(options, dataset, scorer.checkpoint())
+    dataset.download(chosen_numbers(dataset, options), recipe.decoded_cameras, watch.downloading)
     with all_faults(dataset, options):
         episodes = checked_episodes(dataset, options, watch, tables_only=True)
     recipe.check_lengths(episodes)

@@ -139,11 +139,6 @@ class ShownHdf5(ShownDataset):
         """The cameras that are labelled by default."""
         return self.dataset.chosen_cameras()
 
-    @property
-    def fps(self) -> float:
-        """Frames per second: robosuite's control frequency, else its default."""
-        return self.dataset.fps
-
 
 def _changed_ns(file: Path) -> int:
     """Return when a file last changed, a time that its author cannot set. Raises DatasetError."""

@@ -59,7 +59,7 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
                 datasets.append(ShownLeRobot(dataset))
             elif isinstance(dataset, Hdf5Dataset):
                 datasets.append(ShownHdf5(dataset))
-            else:  # RLDS
+            else:
                 datasets.append(ShownDataset(dataset))
             datasets[-1].check()
     except (DatasetError, ImportError) as error:

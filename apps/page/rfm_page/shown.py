@@ -48,7 +48,7 @@ _PREVIEW_PX = (96, 72)  # maximum width and height
 
 @dataclass(frozen=True)
 class ShownDataset:
-    """A dataset for the page, whose pictures are encoded as videos; without a subclass, an RLDS dataset.
+    """A dataset for the page, whose pictures are encoded as videos.
 
     dataset: as ``open_to_show`` returns it
     Methods raise DatasetError for a broken dataset, HTTPException 404 for a missing episode, camera or label file.
@@ -82,8 +82,8 @@ class ShownDataset:
 
     @property
     def fps(self) -> float:
-        """Video frames per second. An RLDS dataset does not say."""
-        return 10.0
+        """Video frames per second, 10 if the dataset does not say."""
+        return self.dataset.fps or 10.0
 
     def times_s(self, episode: DatasetEpisode) -> npt.NDArray[np.float64]:
         """Return float64 [T], each frame's time; evenly spaced in a dataset without times."""

@@ -4,7 +4,7 @@
 The type aliases are ``Literal`` types: ``typing.get_args(Rule)`` lists the rules.
 """
 
-from rfm_client.contract.hub_access import cached_snapshot
+from rfm_client.contract.hub_access import cached_snapshot, hub_errors
 from rfm_client.frames.blank_frames import BlankFrames
 from rfm_client.frames.fit_to_checkpoint import resize_frames
 from rfm_client.frames.inputs import ARRAY_SUFFIXES
@@ -28,6 +28,7 @@ __all__ = [
     "Video",
     "cached_snapshot",
     "frame_times_s",
+    "hub_errors",
     "read_video",
     "resize_frames",
 ]

@@ -99,6 +99,7 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
     count = num_hidden = 0
     with import_av().open(file, format=container) as opened:
         stream = video_stream(opened)
+        unit = stream.time_base
         for packet in opened.demux(stream):
             if (
                 packet.size
@@ -113,7 +114,7 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
             if packet.is_corrupt:
                 raise FrameFileError.of("a whole video file", f"one whose packet {count} is broken ({DOWNLOAD})")
             if packet.pts is not None:
-                times_s.append(float(packet.pts * packet.time_base))
+                times_s.append(packet.pts * unit.numerator / unit.denominator)  # rounded as the fraction is
             count += 1
         tick_s, fps = float(stream.time_base), float(stream.average_rate or 0)
     return Packets(count, np.sort(np.array(times_s, np.float64)), num_hidden, tick_s, fps)

@@ -45,8 +45,9 @@ def evaluate(
     outcome: Annotated[
         str | None,
         typer.Option(
-            help="Outcomes of the episodes: a CSV file (episode, success), or a column of a LeRobot dataset.",
-            metavar="COLUMN|FILE.csv",
+            help="Outcomes of the episodes: a CSV file (episode, success), a column of a LeRobot dataset, an attribute "
+            "or array of each demonstration in HDF5, or a reader.",
+            metavar="NAME|FILE.csv|FILE.py:FUNCTION",
             show_default=False,
         ),
     ] = None,
@@ -99,7 +100,7 @@ def _print_tables(comparison: LabelComparison) -> None:
     if comparison.num_left_out:
         counts += f"; {comparison.num_left_out} left out, which not all files have"
     if comparison.num_without_outcome:
-        counts += f"; {comparison.num_without_outcome} left out, whose outcome is empty"
+        counts += f"; {comparison.num_without_outcome} left out, whose outcome is unknown"
     print_table(counts, columns, rows)
 
 

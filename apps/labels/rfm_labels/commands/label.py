@@ -6,16 +6,17 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias, get_args
 
 import typer
 
 from rfm_client import RewardError
-from rfm_client.command_line import ExitCode, ServerOptions, print_table, report, with_options
+from rfm_client.command_line import ExitCode, JsonOutput, ServerOptions, print_table, report, with_options
 from rfm_client.frames import ChannelOrder, Orientation
 from rfm_client.options import ConfigError, Settings, setting
+from rfm_labels.audit import audit
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, SeveralTasks, parsed_by_camera
 from rfm_labels.datasets.faults import FaultsError, UnusedTaskError, listed, require
 from rfm_labels.datasets.hdf5 import label_prefix
@@ -31,6 +32,7 @@ from rfm_labels.ray_engine import Connect, label_with_ray
 from rfm_labels.scorer import ClientScorer, Scorer
 from rfm_labels.summary import summarise
 
+ASK_BYTES = 10e9  # downloads above this need a confirmation
 SPEED_OVER_S = 600.0  # an episode may take minutes
 Printer: TypeAlias = Callable[[str], None]
 _CAMERA_OPTIONS = ("orient", "channels")  # options with a value per camera
@@ -38,16 +40,19 @@ DatasetArgument = Annotated[
     str,
     typer.Argument(
         metavar="DATASET",
-        help="LeRobot folder or Hub id org/name@revision; HDF5 file, or a folder of them; RLDS folder; folder of "
-        "videos, of folders of pictures, or of .npy and .npz files, with tasks.csv.",
+        help="LeRobot folder, or Hub id org/name@revision or its address; HDF5 file, or a folder of them; RLDS folder; "
+        "folder of videos or of folders of pictures, with tasks.csv; any folder with --videos or --reader.",
     ),
 ]
 
 
 class ProgressBar(Watch):
-    """Writes notes to standard error and, on a terminal, shows a bar with speed and remaining time."""
+    """Writes notes to standard error and, on a terminal, shows a bar with speed and remaining time.
 
-    def __init__(self, say: Printer) -> None:
+    accepts: True: download any number of bytes; False: ask in a terminal, else refuse, above ASK_BYTES
+    """
+
+    def __init__(self, say: Printer, *, accepts: bool = False) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn, TimeRemainingColumn
         from rich.text import Text
@@ -58,7 +63,8 @@ class ProgressBar(Watch):
 
         console = Console(stderr=True)
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Rate(""), TimeRemainingColumn())
-        self._say = say
+        self._say, self._accepts = say, accepts
+        self.notes: list[str] = []
         self._bar = Progress(
             *columns,
             console=console,
@@ -77,7 +83,21 @@ class ProgressBar(Watch):
 
     def note(self, text: str) -> None:
         """Write the text on a line."""
+        self.notes.append(text)
         self._say(f"note: {text}")
+
+    def downloading(self, num_files: int, num_bytes: int) -> None:
+        """Write how much is downloaded. Raises ConfigError, or typer.Abort after a "no", for a large download."""
+        size = f"{num_bytes / 1e9:.2f} GB in {num_files} files"
+        self.note(f"downloading {size}, all that the chosen episodes and cameras need")
+        if num_bytes <= ASK_BYTES or self._accepts:
+            return
+        if not sys.stdin.isatty():
+            remedy = "choose fewer episodes (--episodes, --limit) or cameras (--cameras)"
+            raise ConfigError.at("yes", f"--yes for more than {ASK_BYTES / 1e9:g} GB", f"none for {size}", remedy)
+        self._bar.stop()
+        typer.confirm(f"Download {size}?", abort=True)
+        self._bar.start()
 
     def checking(self, num_episodes: int) -> None:
         """Start counting checked episodes."""
@@ -120,6 +140,12 @@ class EpisodeTexts(Settings):
 
     TITLE: ClassVar[str] = "Dataset"
 
+    reader: str | None = setting(
+        None, "Function that yields the episodes of any folder: my_reader.py:episodes.", metavar="FILE.py:FUNCTION"
+    )
+    videos: str | None = setting(
+        None, "Videos or pictures of any folder: '{episode}/videos/{camera}.mp4'.", metavar="PATTERN"
+    )
     task: str | None = setting(None, "Task sentence of the episodes that have none.")
     override_task: bool = setting(False, "Put --task in the place of the tasks that episodes have.")
     several_tasks: SeveralTasks = setting(
@@ -166,14 +192,18 @@ class EpisodeTexts(Settings):
 
 
 @dataclass(frozen=True)
-class RunOptions(Settings):
+class RunOptions(JsonOutput):
     """Engine, trial run and report of a labelling command."""
 
     TITLE: ClassVar[str] = "Run"
 
     engine: Literal["threads", "ray"] = setting("threads", "threads: in this process. ray: by actors of a Ray cluster.")
-    dry_run: bool = setting(False, "Check everything, count, write nothing.")
+    dry_run: bool = setting(
+        False, "Check everything, count, list doubts (blank or frozen cameras, stale files), write nothing."
+    )
+    json: str | None = setting(None, "With --dry-run: write it as JSON to FILE; - prints it.", metavar="FILE|-")
     report: bool = setting(False, "Only show the summary of labels that are there.")
+    yes: bool = setting(False, f"Download more than {ASK_BYTES / 1e9:g} GB from the Hub without a question.")
 
 
 @with_options
@@ -223,7 +253,7 @@ class LabelCommand:
 
     def run(self) -> ExitCode:
         """Run as the options say. Raises RewardError, OSError and ImportError."""
-        if files := hdf5_files(self.source):
+        if not (self.texts.reader or self.texts.videos) and (files := hdf5_files(self.source)):
             return self._run_each(files)
         if self.options.report:
             self._report()
@@ -271,7 +301,7 @@ class LabelCommand:
         return checked
 
     def _label(self) -> Report:
-        watch = ProgressBar(self.say)
+        watch = ProgressBar(self.say, accepts=self.options.yes)
         try:
             with watch:
                 if self.options.engine == "ray":
@@ -286,20 +316,31 @@ class LabelCommand:
             raise
 
     def _try(self) -> None:
-        """Check everything, write nothing."""
+        """Check everything, list doubts, write no labels."""
+        self.options.begin()
         dataset = self._dataset()
-        with self.connect() as scorer, ProgressBar(self.say) as watch:
+        with self.connect() as scorer, ProgressBar(self.say, accepts=self.options.yes) as watch:
             plan = planned(dataset, scorer, Outputs.of(dataset, self.labels), watch)
+            cameras = plan.recipe.decoded_cameras
+            doubts = audit(dataset, [item.episode for item in plan.items], cameras, watch)
         tasks = sorted({task for item in plan.items for task, _ in item.episode.stretches})
-        cameras = plan.recipe.decoded_cameras
+        source = dataset.source + (f"@{dataset.revision}" if dataset.revision else "")
+        document = {"dataset": source, "kind": dataset.kind, "episodes": len(plan.items), "frames": plan.num_frames}
+        document |= {"cameras": list(cameras), "tasks": tasks, "notes": watch.notes}
+        self.options.write_json(document | {"doubts": [asdict(doubt) for doubt in doubts]})
+        if not self.options.prints_tables:
+            return
         decoded = f"of {len(cameras)} cameras: {plan.num_frames * len(cameras)} to be decoded"
         rows = [
-            ("dataset", f"{dataset.kind}: {dataset.source}" + (f"@{dataset.revision}" if dataset.revision else "")),
+            ("dataset", f"{dataset.kind}: {source}"),
             ("episodes", str(len(plan.items))),
             ("frames", f"{plan.num_frames}, {decoded}"),
             (f"tasks: {len(tasks)}", "; ".join(tasks[:5]) + (" ..." if len(tasks) > 5 else "")),
+            ("doubts", "none" if not doubts else str(len(doubts))),
         ]
         _print(rows)
+        for doubt in doubts:
+            typer.echo(f"doubt: {doubt}")
 
     def _tell(self, report: Report) -> ExitCode:
         if report.failures:

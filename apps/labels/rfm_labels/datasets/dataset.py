@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -86,18 +86,14 @@ class AskedCorrections:
         return cls(**asked)
 
     def of_cameras(
-        self,
-        cameras: Sequence[str],
-        turns: Mapping[str, Orientation] | None = None,
-        orders: Mapping[str, ChannelOrder] | None = None,
+        self, cameras: Sequence[str], turns: Mapping[str, Orientation] | None = None
     ) -> Mapping[str, Correction]:
         """Return corrections by camera, for cameras whose frames change. Raises DatasetError for an unknown camera.
 
         turns: default orientations, unless the caller gives one
-        orders: default channel orders, unless the caller gives one
         """
         orient = {**(turns or {}), **_known("orient", self.orient, cameras)}
-        channels = {**(orders or {}), **_known("channels", self.channels, cameras)}
+        channels = _known("channels", self.channels, cameras)
         found = {camera: Correction.of(camera, orient, channels) for camera in cameras}
         return {camera: correction for camera, correction in found.items() if correction != Correction()}
 
@@ -201,6 +197,7 @@ class Dataset(ABC):
     left_out: pictures that cannot be scored, with the reason; not in ``cameras``
     numbers: all episode numbers, in order
     filter_keys: episode numbers by filter key or split, such as ``train``
+    fps: frames per second, for the page; None: unknown
     given_task: the caller's task
     corrections: how ``frames`` makes stored frames upright RGB, by camera; other cameras stay as stored
     notes: lines for the caller to read before scoring
@@ -216,6 +213,7 @@ class Dataset(ABC):
     left_out: Mapping[str, str] = {}
     numbers: Sequence[int] = ()
     filter_keys: Mapping[str, Sequence[int]] = {}
+    fps: float | None = None
     given_task: TaskOverride = TaskOverride()
     corrections: Mapping[str, Correction] = {}
     notes: Sequence[str] = ()
@@ -282,6 +280,18 @@ class Dataset(ABC):
         """
         named = {camera: word for camera in cameras if (word := word_of_no_colours(camera))}
         return named | {camera: "depth" for camera in cameras if camera in self.depth_cameras}
+
+    def download(  # noqa: B027  a local dataset has all
+        self, numbers: Sequence[int], cameras: Sequence[str], accept: Callable[[int, int], None] | None = None
+    ) -> None:
+        """Download what these episodes and cameras need and is not here yet. Raises DatasetError.
+
+        accept: called before a download with its files and bytes; may raise an error
+        """
+
+    def unused_files(self) -> Sequence[Path]:
+        """Return files with rows or frames that no episode uses, relative to ``root``; empty for most layouts."""
+        return []
 
     @abstractmethod
     def decoder(self, camera: str) -> str | None:
@@ -360,6 +370,7 @@ def iter_episodes(
     Only one episode's frames are in memory at a time.
     """
     names = dataset.chosen_cameras(cameras or ())
+    dataset.download(dataset.numbers, names)
     for episode in dataset.episodes:
         for camera in names:
             dataset.check(episode, camera)

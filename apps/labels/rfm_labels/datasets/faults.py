@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+import sysconfig
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from traceback import extract_tb
 from typing import Any
 
 from rfm_client import RewardError
@@ -15,6 +17,7 @@ from rfm_client.options import InvalidValueError, git_lfs_pointer
 from rfm_client.options import require as require_that
 
 _MOST_SHOWN = 20
+_OTHERS_CODE = (sysconfig.get_path("stdlib"), "site-packages", str(Path(__file__).parents[1]))
 
 
 def listed(numbers: Iterable[int]) -> str:
@@ -85,6 +88,20 @@ class FaultsError(DatasetError):
         if others:
             lines.append(f"to continue without the faulty episodes: --episodes {listed(others)}")
         return cls("\n".join(lines))
+
+
+@contextmanager
+def faults_of_reader(where: object) -> Iterator[None]:
+    """Turn an error in a user's code into a DatasetError that names the last line of that code."""
+    try:
+        yield
+    except RewardError:
+        raise
+    except Exception as error:
+        lines = extract_tb(error.__traceback__)
+        last = [each for each in lines if not any(part in each.filename for part in _OTHERS_CODE)][-1:] or lines[-1:]
+        got = f"{type(error).__name__}: {error} ({Path(last[0].filename).name}, line {last[0].lineno})"
+        raise DatasetError.at(where, "a reader that runs", got) from error
 
 
 require = partial(require_that, error=DatasetError)

@@ -7,7 +7,7 @@ Frame t belongs to row t; in a video, it is the frame at the row's time.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -18,6 +18,7 @@ from rfm_client.frames import Picture, Video
 from rfm_client.options import InvalidValueError, checked_finite
 from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, listed, require
+from rfm_labels.datasets.hub import HubFiles
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S, Frames, Part, VideoRows
 from rfm_labels.datasets.lerobot_meta import (
     EPISODES_FILE,
@@ -47,9 +48,9 @@ _BY_PLACE = "LeRobot finds a sentence by position, so it may read a different on
 
 
 class LeRobotDataset(Dataset):
-    """A LeRobot dataset in a local folder.
+    """A LeRobot dataset in a local folder, which may be a commit's folder in the Hub's cache.
 
-    source, revision: Hub id and commit; None for a local dataset
+    hub: downloads missing files into the folder; None for a local dataset
     tolerance_s: largest gap between a row and its frame, as in LeRobot's ``tolerance_s``
     """
 
@@ -57,8 +58,7 @@ class LeRobotDataset(Dataset):
         self,
         root: Path,
         *,
-        source: str | None = None,
-        revision: str | None = None,
+        hub: HubFiles | None = None,
         task: TaskOverride = TaskOverride(),
         corrections: AskedCorrections = AskedCorrections(),
         tolerance_s: float = TOLERANCE_S,
@@ -69,8 +69,9 @@ class LeRobotDataset(Dataset):
             raise DatasetError.like(error) from None
         require("tolerance_s", tolerance_s > 0, "a number above 0", tolerance_s)
         self.root = root
-        self.source = source or root.resolve().name
-        self.revision = revision
+        self._hub = hub
+        self.source = root.resolve().name if hub is None else hub.name
+        self.revision = None if hub is None else hub.commit
         self.info = info = Info.read(root)
         self.kind = f"LeRobot {info.version}"
         self.cameras = (*info.videos, *info.images)
@@ -80,7 +81,7 @@ class LeRobotDataset(Dataset):
         self._entries = dict(entries)
         self.numbers = sorted(self._entries)  # may have gaps where episodes were deleted
         self.given_task = task
-        self._rows = RowReader(root / "data", self._sentences(), task)
+        self._rows = RowReader(root / "data", self._sentences(), task, hub)
         self._rows_in = lru_cache(max(_VIDEOS_AT_A_TIME, len(info.videos)))(self._read_video)
         self._clocks: dict[int, str] = {}  # for the episodes read so far
         numbers = Counter(number for number, _ in entries)
@@ -114,10 +115,37 @@ class LeRobotDataset(Dataset):
         for entry in self._entries.values():
             try:
                 if isinstance(entry, Entry):
+                    self._here(entry.data_file)
                     return entry.data_file, column_types(entry.data_file)
             except DatasetError:  # raised again when its episode is read
                 continue
         return None, {}
+
+    def download(
+        self, numbers: Sequence[int], cameras: Sequence[str], accept: Callable[[int, int], None] | None = None
+    ) -> None:
+        if self._hub is None:
+            return
+        entries = [each for number in numbers if isinstance(each := self._entries[number], Entry)]
+        places = [entry.videos.get(camera) for entry in entries for camera in cameras]
+        files = [entry.data_file for entry in entries] + [place[0] for place in places if isinstance(place, tuple)]
+        sizes = self._hub.sizes(files)
+        if sizes and accept is not None:
+            accept(len(sizes), sum(sizes.values()))
+        self._hub.download(self.root / name for name in sizes)
+
+    def unused_files(self) -> Sequence[Path]:
+        entries = [each for each in self._entries.values() if isinstance(each, Entry)]
+        used = {entry.data_file for entry in entries}
+        used |= {place[0] for entry in entries for place in entry.videos.values() if isinstance(place, tuple)}
+        found = {file for pattern in ("data/**/*.parquet", "videos/**/*.mp4") for file in self.root.glob(pattern)}
+        return sorted(file.relative_to(self.root) for file in found - used)
+
+    def _here(self, file: Path) -> Path:
+        """Return the file, after its download if it is missing and the dataset is the Hub's. Raises DatasetError."""
+        if self._hub is not None:
+            self._hub.download([file])
+        return file
 
     def read_episode(self, number: int) -> DatasetEpisode:
         entry = self._entry(number)
@@ -134,7 +162,7 @@ class LeRobotDataset(Dataset):
             return digest_of(image + turn_mark(image).encode() for image in self._images(episode, camera))
         video, from_s = self._entry(episode.index).video(camera)
         clock = self._clocks[episode.index]
-        return f"{file_identity(video, self.revision)} {from_s}{clock}"
+        return f"{file_identity(self._here(video), self.revision)} {from_s}{clock}"
 
     def check(self, episode: DatasetEpisode, camera: str) -> None:
         if camera in self.info.videos:
@@ -182,7 +210,7 @@ class LeRobotDataset(Dataset):
 
     def _read_video(self, camera: str, file: Path) -> VideoRows:
         """A video with the rows from all readable episodes in it."""
-        video = Video(file, _CONTAINER.get(file.suffix.lower()))
+        video = Video(self._here(file), _CONTAINER.get(file.suffix.lower()))
         with faults_at(file):
             require(file, len(video.packets.times_s) > 0, "frames with time stamps", "none")
         parts = []
@@ -206,6 +234,6 @@ class LeRobotDataset(Dataset):
         if not isinstance(path, str) or Path(path).is_absolute() or ".." in Path(path).parts:
             raise DatasetError.at(where, "an image, or its path inside the dataset", repr(path))
         try:
-            return (self.root / path).read_bytes()
+            return self._here(self.root / path).read_bytes()
         except OSError as error:
             raise DatasetError.at(where, "an image file", f"{error.strerror} ({path})") from error

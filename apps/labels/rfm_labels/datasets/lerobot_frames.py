@@ -117,6 +117,11 @@ class VideoRows:
         return f" (the video has {self.video.packets.fps:.2f} frames a second, meta/info.json says {self.fps:g})"
 
     def _remedy(self, match: _Match, rows: slice) -> str:
+        num_frames, num_rows = len(self.video.packets.times_s), len(self._rows_s)
+        if num_frames < num_rows and not self._rates:
+            return (
+                f"the video has {num_frames} frames for {num_rows} rows, as if some were dropped in recording; {_AGAIN}"
+            )
         if self._rates and len(self._rows_s) == len(self.video.packets.times_s):
             return "give both the same rate"
         late_s = match.late_s[rows]

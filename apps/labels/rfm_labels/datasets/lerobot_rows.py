@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from rfm_labels.datasets.dataset import TaskOverride
 from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.datasets.hub import HubFiles
 from rfm_labels.datasets.lerobot_meta import Entry, Info, json_lines, number_in, read_table
 from rfm_labels.datasets.stored_files import digest_of
 
@@ -62,10 +63,12 @@ class RowReader:
     data: folder with all rows
     tasks: sentences by number
     given: the caller's task
+    hub: downloads missing files; None for a local dataset
     """
 
-    def __init__(self, data: Path, tasks: Sentences, given: TaskOverride) -> None:
+    def __init__(self, data: Path, tasks: Sentences, given: TaskOverride, hub: HubFiles | None = None) -> None:
         self._data = data
+        self._hub = hub
         self._tasks = tasks
         self._given = given
         self._columns = lru_cache(_FILES_AT_A_TIME)(_read_columns)
@@ -100,6 +103,8 @@ class RowReader:
         LeRobot 0.4.0's converter could name the previous file. LeRobot does not notice, since it reads all files and
         selects by ``episode_index``.
         """
+        if self._hub is not None:
+            self._hub.download([entry.data_file])
         stored = self._columns(entry.data_file, self._tasks.column)["episode_index"]
         return entry.data_file if (stored == entry.index).any() else self._files.get(entry.index, entry.data_file)
 
@@ -107,6 +112,8 @@ class RowReader:
     def _files(self) -> Mapping[int, Path]:
         """File by episode number; broken files are skipped."""
         found: dict[int, Path] = {}
+        if self._hub is not None:
+            self._hub.download_folder(self._data)
         for file in sorted(self._data.rglob("*.parquet")):
             with suppress(DatasetError):
                 numbers = read_table(file, ["episode_index"])["episode_index"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Open a dataset by path or Hub id, or explain how to convert an unsupported layout.
+"""Open a dataset by path or Hub id, by a pattern or by a reader, or explain how to open an unknown layout.
 
 ``tasks.csv`` lists a folder's episodes in order. The columns ``video`` (or ``episode``) and ``task`` are separated by
 commas, semicolons or tabs. Quote a task that contains the separator. Paths are relative to the table.
@@ -11,63 +11,52 @@ import csv
 import io
 import os
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any
 
-from rfm_client.frames import ARRAY_SUFFIXES, ChannelOrder, Orientation, cached_snapshot
+from rfm_client.frames import ChannelOrder, Orientation
 from rfm_client.options import first_names
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER, AskedCorrections, Dataset, SeveralTasks, TaskOverride
+from rfm_labels.datasets.episodes import Episode, EpisodeDataset
 from rfm_labels.datasets.faults import DatasetError, FaultsError, require, shortened
-from rfm_labels.datasets.folders import (
-    PICTURE_SUFFIXES,
-    ArrayFiles,
-    EpisodeFiles,
-    FrameFolders,
-    UnitreeFolders,
-    VideoFolder,
-    in_natural_order,
-    is_of_unitree,
-    is_pattern,
-    is_picture,
-)
 from rfm_labels.datasets.hdf5 import SUFFIXES, Hdf5Dataset, is_hdf5
+from rfm_labels.datasets.hub import HubFiles
 from rfm_labels.datasets.lerobot import LeRobotDataset
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
 from rfm_labels.datasets.lerobot_meta import INFO_FILE, Info
 from rfm_labels.datasets.lerobot_rows import TASK_COLUMN
+from rfm_labels.datasets.patterns import files_below, files_of_pattern, suggested_pattern
+from rfm_labels.datasets.pictures_in_order import PICTURE_SUFFIXES, in_natural_order, is_picture
+from rfm_labels.datasets.readers import Reader, is_reader, open_read
 from rfm_labels.datasets.rlds import RldsDataset, rlds_folder
 from rfm_labels.datasets.rlds_files import FEATURES_FILE
 
 TABLE = "tasks.csv"
 _NAMES = ("video", "episode")  # column names for the path
 _DELIMITERS = ",;\t"
-_HUB_ID = re.compile(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")
+_HUB_ID = re.compile(r"(?:hf://datasets/|https?://[^/]+/datasets/)?([\w.-]+/[\w.-]+)(?:(?:@|/tree/)([\w./-]+?))?/?")
 _LAYOUTS = (
     f"a LeRobot dataset ({INFO_FILE}), an RLDS dataset ({FEATURES_FILE}), an HDF5 file ({', '.join(SUFFIXES)}), a "
-    f"folder of videos, of folders of pictures or of {' and '.join(ARRAY_SUFFIXES)} files with {TABLE}, "
-    "or a Hub id org/name[@revision]"
+    f"folder of videos or of folders of pictures with {TABLE}, any folder with --videos or --reader, or a Hub id "
+    "org/name[@revision]"
 )
-_CONVERT = "convert them to LeRobot, or write each episode's pictures to a video and list the videos in tasks.csv"
+_READER = "write a reader of ten lines (--reader; examples/readers)"
 _GIVE_TASK = '--task "SENTENCE"'
-_FILL = "put a video, an array or a folder of pictures for each episode in it"
 _UNREAD = {  # remedies for layouts without a reader, by file name pattern
     r"meta_data": "a LeRobot dataset of v1: convert it to v2.0 with LeRobot 0.3",
     r".*\.tfrecord.*": f"TFRecord files without {FEATURES_FILE}, which TensorFlow Datasets 4.6 or later writes beside "
     "them: copy the whole folder of the version",
-    r".*\.zarr(\.zip)?|\.z(group|array|attrs|metadata)|zarr\.json": f"Zarr arrays: {_CONVERT}",
-    r".*\.(bag|mcap|db3)": f"a rosbag: {_CONVERT}",
+    r".*\.zarr(\.zip)?|\.z(group|array|attrs|metadata)|zarr\.json": f"Zarr arrays: {_READER}",
+    r".*\.(bag|mcap|db3)": f"a rosbag: {_READER}",
 }
 _VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov", ".webm", ".avi")
-_SUFFIXES = {"videos": _VIDEO_SUFFIXES, "arrays": ARRAY_SUFFIXES, "HDF5 files": SUFFIXES, "pictures": PICTURE_SUFFIXES}
-_KINDS: dict[str, tuple[type[EpisodeFiles], str]] = {  # reader, and what an episode is called
-    "videos": (VideoFolder, "video"),
-    "folders of pictures": (FrameFolders, "folder"),
-    "arrays": (ArrayFiles, "file"),
-    "recordings of Unitree": (UnitreeFolders, "folder"),
+_SUFFIXES = {"videos": _VIDEO_SUFFIXES, "HDF5 files": SUFFIXES, "pictures": PICTURE_SUFFIXES}
+_KINDS = {  # the dataset's kind, its camera, and what an episode is called
+    "videos": ("videos", "video", "video"),
+    "folders of pictures": ("folders of frames", "frames", "folder"),
 }
-_ORDER = ("videos", "arrays", "HDF5 files", "recordings of Unitree", "folders of pictures", "pictures")
-_OWN_TASKS = ("arrays", "recordings of Unitree")
+_ORDER = ("videos", "HDF5 files", "folders of pictures", "pictures")
 _OUR_FILES = re.compile(r".*_summary\.png|.*\.[\w-]+_rewards\.hdf5")  # beside labelled episodes; HDF5: from 0.4
 
 
@@ -122,6 +111,8 @@ def _normal(root: Path, path: str) -> str:
 def open_dataset(
     source: str | Path,
     *,
+    reader: str | Reader | None = None,
+    videos: str | None = None,
     task: str | None = None,
     override_task: bool = False,
     several_tasks: SeveralTasks = "each",
@@ -130,8 +121,13 @@ def open_dataset(
     channels: ChannelOrder | Mapping[str, ChannelOrder] | None = None,
     tolerance_s: float = TOLERANCE_S,
 ) -> Dataset:
-    """Open the dataset at a path, or download the Hub id ``org/name[@revision]``. An existing path wins.
+    """Open the dataset at a path, or on the Hub: ``org/name[@revision]``, or its address. An existing path wins.
 
+    Of a dataset on the Hub, only the metadata are downloaded. ``Dataset.download`` fetches what episodes need.
+
+    reader: function that yields the episodes of the folder, each an ``Episode``, or its name, ``FILE.py:FUNCTION``
+    videos: pattern for videos, pictures or arrays below the folder, such as ``{episode}/videos/{camera}.mp4`` or
+        ``{episode}/colors/*_{camera}.jpg``
     task: task for episodes without their own
     override_task: True: use ``task`` for all episodes
     several_tasks: if a LeRobot episode has several tasks: ``each``: frames keep their own; ``first``: all frames get
@@ -147,51 +143,55 @@ def open_dataset(
     Raises DatasetError.
     """
     path, given = Path(source), TaskOverride(task, override_task, several_tasks, task_column)
-    corrections = AskedCorrections.of(orient, channels)
+    asked = AskedCorrections.of(orient, channels)
+    if reader is not None or videos is not None:
+        require("videos", reader is None or videos is None, "none with a reader, which names the files", videos)
+        require("task_column", task_column is None, "none with a reader or a pattern", task_column)
+        return (
+            _by_pattern(path, videos or "", given, asked) if reader is None else open_read(reader, path, given, asked)
+        )
     if (path / INFO_FILE).is_file():
-        return LeRobotDataset(path, task=given, corrections=corrections, tolerance_s=tolerance_s)
-    if folder := rlds_folder(path):
-        return RldsDataset(folder, task=given, corrections=corrections)
-    has_columns = task_column is None or not path.exists()
-    require("task_column", has_columns, f"none, since {path} is no LeRobot or RLDS dataset", task_column)
-    if is_hdf5(path):
-        return Hdf5Dataset(path, task=given, corrections=corrections)
+        return LeRobotDataset(path, task=given, corrections=asked, tolerance_s=tolerance_s)
     if path.exists():
-        return _open_files(path, given, corrections)
+        return _open_path(path, given, asked)
     match = _HUB_ID.fullmatch(str(source))
     if match is None:
         raise DatasetError.at(source, _LAYOUTS, "none")
-    return _from_hub(match[1], match[2], task=given, corrections=corrections, tolerance_s=tolerance_s)
+    return _from_hub(match[1], match[2], task=given, corrections=asked, tolerance_s=tolerance_s)
+
+
+def _open_path(path: Path, task: TaskOverride, corrections: AskedCorrections) -> Dataset:
+    """Open a file or folder that is not LeRobot's. Raises DatasetError."""
+    if folder := rlds_folder(path):
+        return RldsDataset(folder, task=task, corrections=corrections)
+    require("task_column", task.column is None, f"none, since {path} is no LeRobot or RLDS dataset", task.column)
+    return (Hdf5Dataset if is_hdf5(path) else _open_files)(path, task=task, corrections=corrections)
 
 
 def _from_hub(name: str, revision: str | None, **opening: Any) -> LeRobotDataset:
-    try:
-        folder = cached_snapshot(name, "dataset", revision)
-    except ImportError as error:
-        raise ImportError("datasets of the Hub need huggingface-hub: pip install ./client ./apps/labels") from error
-    except OSError as error:
-        raise DatasetError.at(name, "a local dataset or one of the Hub", f"none: {error}") from error
-    if not (folder / INFO_FILE).is_file():
-        raise DatasetError.at(name, f"a LeRobot dataset's {INFO_FILE}", _unread(folder) or "none")
-    commit = folder.name  # a snapshot's folder is named after the commit
-    return LeRobotDataset(folder, source=name, revision=commit, **opening)
+    hub = HubFiles(name, revision)
+    if not (hub.folder / INFO_FILE).is_file():
+        raise DatasetError.at(name, f"a LeRobot dataset's {INFO_FILE}", _unread(hub.folder) or "none")
+    return LeRobotDataset(hub.folder, hub=hub, **opening)
 
 
-def open_to_show(source: str) -> LeRobotDataset | Hdf5Dataset | RldsDataset:
-    """Open a LeRobot or RLDS folder or an HDF5 file for a viewer. Raises DatasetError.
+def open_to_show(source: str) -> Dataset:
+    """Open a dataset for a viewer: a path, or ``READER=FOLDER`` or ``PATTERN=FOLDER``. Raises DatasetError.
 
-    Accepts blank and outdated tasks. A row shows the nearest frame, as a player does.
+    Accepts blank and outdated tasks. In a LeRobot dataset, a row shows the nearest frame, as a player does.
     """
+    how, _, folder = source.partition("=")
+    no_tasks, as_stored = TaskOverride(is_needed=False), AskedCorrections()
+    if is_reader(how):
+        return open_read(how, Path(folder).resolve(), no_tasks, as_stored)
+    if "{episode}" in how:
+        return _by_pattern(Path(folder).resolve(), how, no_tasks, as_stored)
     path = Path(source).resolve()
-    if is_hdf5(path):
-        return Hdf5Dataset(path, task=TaskOverride(is_needed=False))
-    if not (path / INFO_FILE).is_file():
-        if folder := rlds_folder(path):
-            return RldsDataset(folder, task=TaskOverride(is_needed=False))
-        expected = f"the folder of a LeRobot ({INFO_FILE}) or RLDS dataset ({FEATURES_FILE}), or an HDF5 file"
-        raise DatasetError.at("", expected, source)
-    task = TaskOverride(column=TASK_COLUMN, is_needed=False)
-    return LeRobotDataset(path, task=task, tolerance_s=0.5 / Info.read(path).fps)
+    if (path / INFO_FILE).is_file():
+        task = TaskOverride(column=TASK_COLUMN, is_needed=False)
+        return LeRobotDataset(path, task=task, tolerance_s=0.5 / Info.read(path).fps)
+    require("", path.exists(), _LAYOUTS, source)
+    return _open_path(path, no_tasks, as_stored)
 
 
 def hdf5_files(folder: str | Path) -> list[Path]:
@@ -203,9 +203,8 @@ def hdf5_files(folder: str | Path) -> list[Path]:
     is_other = any((root / name).is_file() for name in (INFO_FILE, TABLE))
     if not root.is_dir() or is_other or set(_found(root)) - {"HDF5 files"}:
         return []
-    names = (str(file.relative_to(root)) for file in root.rglob("*") if file.suffix.lower() in SUFFIXES)
-    shown = [name for name in names if "/." not in f"/{name}" and not _OUR_FILES.fullmatch(name)]
-    return [root / name for name in in_natural_order(shown)]
+    names = [name for name in files_below(root) if name.lower().endswith(SUFFIXES) and not _OUR_FILES.fullmatch(name)]
+    return [root / name for name in in_natural_order(names)]
 
 
 def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -> Dataset:
@@ -214,43 +213,72 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
         raise DatasetError.at(path, _LAYOUTS, _unread(path) or "another file")
     table = path / TABLE if path.is_dir() else path
     if table.is_file():
-        tasks = read_table_of_tasks(table, has_tasks=task.text is None)
-        there = [name for name in tasks if (table.parent / name).exists()] or list(tasks)
-        found = {_kind_of(table.parent / name): name for name in reversed(there)}
+        root, tasks = table.parent, read_table_of_tasks(table, has_tasks=task.text is None and task.is_needed)
+        there = [name for name in tasks if (root / name).exists()] or list(tasks)
+        pattern = next((name for name in tasks if "*" in name and not (root / name).exists()), "")
+        got = f"{pattern}: name the pictures by --videos '{{episode}}/{Path(pattern).name}', and folders in the table"
+        require(table, not pattern, "files and folders, and no patterns", got)
+        found = {_kind_of(root / name): name for name in reversed(there)}
         kinds = {kind if kind in _KINDS else "videos": name for kind, name in found.items()}
         examples = " and ".join(f"{kind} ({name})" for kind, name in sorted(kinds.items()))
         require(table, len(kinds) == 1, "episodes of one kind", f"{examples}: write a table for each kind")
         (kind,) = kinds
-        dataset = _KINDS[kind][0](table.parent, tasks, table, task, corrections)
-        dataset.notes = [*dataset.notes, *_unlisted(table, kind, tasks)]
-        return dataset
-    require(path, path.is_dir(), _LAYOUTS, "neither")
-    kind, names = _listed(path)
-    reader, episode = _KINDS[kind]
-    expected, old_table = f"{TABLE} with the task of each {episode}", path / "tasks.json"  # as 0.4 read it
+        notes = _notes(table, kind, _unlisted(table, kind, tasks))
+    else:
+        require(path, path.is_dir(), _LAYOUTS, "neither")
+        (kind, names), root, table, notes = _listed(path), path, path, []
+        _check_tasks(path, task, _KINDS[kind][2])
+        tasks = dict.fromkeys(names)
+    shown, camera, _ = _KINDS[kind]
+    episodes = (Episode(name, {camera: root / name}, own) for name, own in tasks.items())
+    return EpisodeDataset(episodes, root, shown, table, task, corrections, notes)
+
+
+def _check_tasks(folder: Path, task: TaskOverride, episode: str) -> None:
+    """Raise DatasetError for a folder without a table of tasks, if it needs one. episode: what it is called"""
+    expected, old_table = f"{TABLE} with the task of each {episode}", folder / "tasks.json"  # as 0.4 read it
     got = f"{old_table.name}: write it as {TABLE}, with the columns video and task"
-    require(path, not old_table.is_file(), expected, got)
+    require(folder, not old_table.is_file(), expected, got)
     got = f"none: write it, or, if all of them have one task, give it: {_GIVE_TASK}"
-    require(path, task.text is not None or kind in _OWN_TASKS, expected, got)
-    return reader(path, dict.fromkeys(names), path, task, corrections)
+    require(folder, task.text is not None or not task.is_needed, expected, got)
+
+
+def _by_pattern(root: Path, pattern: str, task: TaskOverride, corrections: AskedCorrections) -> EpisodeDataset:
+    """Open the files that match a pattern. A table of tasks names the episodes. Raises DatasetError."""
+    require(root, root.is_dir(), "the folder of the recordings", "none")
+    found, table = files_of_pattern(root, pattern), root / TABLE
+    tasks: Mapping[str, str | None] = dict.fromkeys(found)
+    if table.is_file():
+        tasks = read_table_of_tasks(table, has_tasks=task.text is None and task.is_needed)
+        missing = [name for name in tasks if name not in found]
+        got = f"{first_names(missing)}; there are {first_names(found)}"
+        require(table, not missing, f"episodes of {pattern}", got)
+    else:
+        _check_tasks(root, task, "episode")
+    episodes = (Episode(name, found[name], own) for name, own in tasks.items())
+    notes = _notes(table, "episodes", [name for name in found if name not in tasks])
+    where = table if table.is_file() else root
+    return EpisodeDataset(episodes, root, f"pattern {pattern}", where, task, corrections, notes)
 
 
 def _unlisted(table: Path, kind: str, names: Collection[str]) -> list[str]:
-    """A note on episodes that lie beside the table's but are not listed; empty if there are none."""
-    names = {str(Path(name).parent) if is_pattern(table.parent / name) else name for name in names}
+    """The episodes that lie beside the table's but are not listed."""
     beside = {table.parent, *((table.parent / name).parent for name in names)} if kind in _SUFFIXES else {table.parent}
     found = [folder / name for folder in sorted(beside) if folder.is_dir() for name in _found(folder).get(kind, ())]
     if kind == "folders of pictures":  # ``_found`` also has folders without pictures
         found = [each for each in found if any(_is_frame(file) for file in each.iterdir())]
-    gone = in_natural_order({Path(os.path.relpath(each, table.parent)).as_posix() for each in found} - set(names))
+    return in_natural_order({Path(os.path.relpath(each, table.parent)).as_posix() for each in found} - set(names))
+
+
+def _notes(table: Path, kind: str, gone: Sequence[str]) -> list[str]:
     note = f"{table.name}: {len(gone)} {kind} beside it are not listed and get no labels: {first_names(gone)}"
     return [note] if gone else []
 
 
 def _kind_of(path: Path) -> str | None:
     """What an episode's file or folder is, by name; None: another file."""
-    if path.is_dir() or is_pattern(path):
-        return "recordings of Unitree" if is_of_unitree(path) else "folders of pictures"
+    if path.is_dir():
+        return "folders of pictures"
     return next((kind for kind, suffixes in _SUFFIXES.items() if path.suffix.lower() in suffixes), None)
 
 
@@ -261,8 +289,9 @@ def _listed(folder: Path) -> tuple[str, list[str]]:
     got = f"{examples}: list the episodes of one kind in tasks.csv"
     require(folder, len(found) < 2, "episodes of one kind", got)
     if not any(kind in _KINDS for kind in found):
-        other = f"{'other files' if _names_in(folder) else 'an empty folder'}: {_FILL}"
-        raise DatasetError.at(folder, _LAYOUTS, _unread(folder) or other)
+        other = "other files" if _names_in(folder) else "an empty folder"
+        remedy = f"put a video or a folder of pictures for each episode in it, or {_READER}"
+        raise DatasetError.at(folder, _LAYOUTS, _unread(folder) or f"{other}: {remedy}")
     return next(iter(found.items()))
 
 
@@ -302,11 +331,9 @@ def _unread(path: Path) -> str | None:
         return f"a folder of HDF5 files, each a dataset of its own: {remedy}"
     if any(_is_frame(file) for file in path.iterdir()):
         return "pictures outside of the folder of an episode"
-    suffixes = {**dict.fromkeys(_VIDEO_SUFFIXES, "videos"), **dict.fromkeys(PICTURE_SUFFIXES, "pictures")}
-    shown = (file for file in path.rglob("*") if file.is_file() and not file.name.startswith("."))
-    deeper = next((file for file in shown if file.suffix.lower() in suffixes), None)
+    kinds = {**dict.fromkeys(_VIDEO_SUFFIXES, "videos"), **dict.fromkeys(PICTURE_SUFFIXES, "pictures")}
+    deeper = next((name for name in files_below(path) if Path(name).suffix.lower() in kinds), None)
     if deeper is None:
         return None
-    kind = suffixes[deeper.suffix.lower()]
-    what, listed = ("videos", deeper) if kind == "videos" else ("folders", deeper.parent)
-    return f"{kind} in deeper folders: list the {what} of one camera ({listed.relative_to(path)}) in tasks.csv"
+    remedy = f"name the episode and the camera in their paths, perhaps --videos '{suggested_pattern(path, deeper)}'"
+    return f"{kinds[Path(deeper).suffix.lower()]} in deeper folders ({deeper}): {remedy}; or {_READER}"

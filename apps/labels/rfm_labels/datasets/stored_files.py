@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,20 +29,35 @@ def digest_of(parts: Iterable[bytes]) -> str:
     return digest.hexdigest()
 
 
-def file_identity(file: Path, revision: str | None = None) -> str:
+def file_identity(file: Path, revision: str | None = None, what: str = "video") -> str:
     """Return a text that identifies a file: size and modification time.
 
     revision: commit on the Hub; replaces the time, which differs between machines
+    what: kind of file, for messages
 
     Raises DatasetError.
     """
     try:
         status = file.stat()
     except FileNotFoundError as error:
-        raise DatasetError.at(file, "a video file", "none") from error
+        raise DatasetError.at(file, f"a {what} file", "none") from error
     except OSError as error:
-        raise DatasetError.at(file, "a readable video file", error.strerror) from error
+        raise DatasetError.at(file, f"a readable {what} file", error.strerror) from error
     return f"{status.st_size} {revision or status.st_mtime_ns}"
+
+
+def colours_fault(pixels: Any) -> str:
+    """Return why an array is no frames, uint8 [T, H, W, 3]; empty if it is."""
+    shape = pixels.shape if len(pixels.shape) == 4 else (0, 0, 0, 0)
+    what = "a depth map, a mask or another form: no colours as uint8 [T, H, W, 3]"
+    if shape[3] == 3:
+        is_empty = "no pixels" if 0 in shape[1:] else ""
+        what = is_empty if pixels.dtype == np.uint8 else "not uint8: store colours as 0..255"
+    elif shape[3] == 4:
+        what = "RGBA: store its first three channels, if they are uint8 RGB"
+    elif shape[1] in (3, 4):
+        what = "channels first: store it as uint8 [T, H, W, 3]"
+    return what and f"{pixels.dtype} {list(pixels.shape)}, {what}"
 
 
 def turn_mark(picture: bytes | Path) -> str:
