@@ -135,7 +135,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "a column without a dataset": (
         lambda folder: read_outcomes("success", folder),
-        "outcome: expected a CSV file, or a column of a local LeRobot dataset, got 'success'",
+        "outcome: expected a CSV file, a column of a local LeRobot dataset, or a reader, got 'success'",
     ),
     "a column of other numbers": (
         lambda folder: read_outcomes("timestamp", copied("toy_v30_many", folder)),
