@@ -477,5 +477,5 @@ def test_only_the_files_of_the_chosen_episodes_and_cameras_are_downloaded(
         assert [line.split(" GB")[1] for line in notes if "downloading" in line] == [
             " in 2 files, all that the chosen episodes and cameras need"
         ] * 2
-        dataset = open_dataset(f"{endpoint}/datasets/{HUB_ID}/tree/main")
+        dataset = open_dataset(f"https://huggingface.co/datasets/{HUB_ID}/tree/main")
         assert sum(1 for _ in dataset.frames(dataset.episode(0), WRIST)) == dataset.episode(0).num_frames  # on demand

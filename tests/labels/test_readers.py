@@ -341,7 +341,7 @@ EPISODES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "a task of another type": ({"task": 3}, "task: expected a sentence, got 3"),
     "no rate": ({"fps": 0}, "fps: expected frames per second, above 0, got 0"),
-    "an outcome in words": ({"success": "yes"}, "success: expected True, False or None \\(.*\\), got 'yes'"),
+    "an outcome in words": ({"success": "yes"}, r"success: expected True, False or None .*, got 'yes'"),
 }
 
 

@@ -49,7 +49,7 @@ def audit(
         doubts.append(Doubt(f"{what}; left from a recording that was written again?"))
     for name in _OUTCOMES:
         with suppress(RewardError):  # no such column
-            outcomes = read_outcomes(name, dataset.root)
+            outcomes = read_outcomes(name, getattr(dataset, "file", dataset.root))
             if missing := [each.index for each in episodes if outcomes.get(each.index) is None]:
                 doubts.append(Doubt(f"{name}: {len(missing)} episodes without an outcome: {listed(missing)}"))
     chosen = _neighbours(len(episodes))

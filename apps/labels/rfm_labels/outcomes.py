@@ -69,7 +69,9 @@ def _of_csv(file: Path) -> Stored:
 
 def _of_hdf5(name: str, file: Path) -> Stored:
     with opened_hdf5(file) as opened:
-        groups = {number: group for number, (_, group) in demonstrations(file, opened).items() if group is not None}
+        groups = {
+            number: group for number, (_, group) in demonstrations(file, opened).items() if hasattr(group, "keys")
+        }
         known = sorted({each for group in groups.values() for each in (*group.attrs, *_arrays(group))})
         require("outcome", name in known, f"a CSV file, a reader, or one of {', '.join(known)}", repr(name))
         return {
@@ -112,7 +114,7 @@ def _outcomes(source: str, stored: Stored) -> dict[int, bool | None]:
     found = {text for text in chain.from_iterable(texts.values()) if _MEANINGS.get(text, True) is not None}
     expected = "-1 or 1 in some episode, which shows whether 0 is a failure"
     require(f"outcome: {source}", "reward" not in source or found != {"0"}, expected, "0 in all")
-    are_costs = "-1" in found and found <= _COSTS.keys()
+    are_costs = "reward" in source and "-1" in found and found <= _COSTS.keys()
     meanings: Mapping[str, bool | None] = {**_MEANINGS, **_COSTS} if are_costs else _MEANINGS
     outcomes: dict[int, bool | None] = {}
     for episode, (where, values) in stored.items():

@@ -205,6 +205,11 @@ class RunOptions(JsonOutput):
     report: bool = setting(False, "Only show the summary of labels that are there.")
     yes: bool = setting(False, f"Download more than {ASK_BYTES / 1e9:g} GB from the Hub without a question.")
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.json is not None and not self.dry_run:
+            raise ConfigError.of_two("json", "needs", "dry_run")
+
 
 @with_options
 def label(
@@ -265,6 +270,9 @@ class LabelCommand:
 
     def _run_each(self, files: Sequence[Path]) -> ExitCode:
         """Run for each HDF5 file in a folder, once all can be opened. Raises DatasetError if one cannot."""
+        require(
+            "json", self.options.json is None, "none for a folder of HDF5 files; name one of them", self.options.json
+        )
         stems = [file.stem for file in files]
         twice = [str(file) for file in files if stems.count(file.stem) > 1]
         got = f"{', '.join(twice)}: leave out --output, and labels lie beside their files"

@@ -128,7 +128,9 @@ class LeRobotDataset(Dataset):
             return
         entries = [each for number in numbers if isinstance(each := self._entries[number], Entry)]
         places = [entry.videos.get(camera) for entry in entries for camera in cameras]
-        files = [entry.data_file for entry in entries] + [place[0] for place in places if isinstance(place, tuple)]
+        videos = {place[0] for place in places if isinstance(place, tuple)}
+        shared = [each for (_, video), sharing in self._in_video.items() if video in videos for each in sharing]
+        files = [*videos, *(entry.data_file for entry in (*entries, *shared))]
         sizes = self._hub.sizes(files)
         if sizes and accept is not None:
             accept(len(sizes), sum(sizes.values()))

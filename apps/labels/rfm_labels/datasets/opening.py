@@ -35,7 +35,9 @@ from rfm_labels.datasets.rlds_files import FEATURES_FILE
 TABLE = "tasks.csv"
 _NAMES = ("video", "episode")  # column names for the path
 _DELIMITERS = ",;\t"
-_HUB_ID = re.compile(r"(?:hf://datasets/|https?://[^/]+/datasets/)?([\w.-]+/[\w.-]+)(?:(?:@|/tree/)([\w./-]+?))?/?")
+_HUB_ID = re.compile(
+    r"(?:hf://datasets/|https://(?:huggingface\.co|hf\.co)/datasets/)?([\w.-]+/[\w.-]+)(?:@([\w./-]+)|/tree/([\w.-]+))?/?"
+)
 _LAYOUTS = (
     f"a LeRobot dataset ({INFO_FILE}), an RLDS dataset ({FEATURES_FILE}), an HDF5 file ({', '.join(SUFFIXES)}), a "
     f"folder of videos or of folders of pictures with {TABLE}, any folder with --videos or --reader, or a Hub id "
@@ -157,7 +159,7 @@ def open_dataset(
     match = _HUB_ID.fullmatch(str(source))
     if match is None:
         raise DatasetError.at(source, _LAYOUTS, "none")
-    return _from_hub(match[1], match[2], task=given, corrections=asked, tolerance_s=tolerance_s)
+    return _from_hub(match[1], match[2] or match[3], task=given, corrections=asked, tolerance_s=tolerance_s)
 
 
 def _open_path(path: Path, task: TaskOverride, corrections: AskedCorrections) -> Dataset:
@@ -171,7 +173,8 @@ def _open_path(path: Path, task: TaskOverride, corrections: AskedCorrections) ->
 def _from_hub(name: str, revision: str | None, **opening: Any) -> LeRobotDataset:
     hub = HubFiles(name, revision)
     if not (hub.folder / INFO_FILE).is_file():
-        raise DatasetError.at(name, f"a LeRobot dataset's {INFO_FILE}", _unread(hub.folder) or "none")
+        got = (hub.folder.is_dir() and _unread(hub.folder)) or "none: hf download it, and name its folder"
+        raise DatasetError.at(name, f"a LeRobot dataset's {INFO_FILE}", got)
     return LeRobotDataset(hub.folder, hub=hub, **opening)
 
 
