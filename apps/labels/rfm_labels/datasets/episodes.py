@@ -6,19 +6,20 @@ A reader is a function that is called with the recordings' folder and yields an 
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from types import FunctionType
+from types import CellType, FunctionType
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from rfm_client import UInt8Array
 from rfm_client.frames import Picture, Video
-from rfm_labels.datasets.dataset import AskedCorrections, TaskOverride
+from rfm_labels.datasets.dataset import AskedCorrections, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import faults_of_reader, require
 from rfm_labels.datasets.pictures_in_order import pictures_in
 from rfm_labels.datasets.recorded import Recorded, RecordedDataset, Stored
@@ -173,7 +174,7 @@ class _Pixels(Stored):
             for t, frame in enumerate(self._given() if callable(self._given) else self._given):
                 fault = colours_fault(frame[np.newaxis]) if isinstance(frame, np.ndarray) else type(frame).__name__
                 require(f"{self._where}: frame {t}", not fault, "uint8 [H, W, 3]", fault)
-                yield frame
+                yield frame.copy() if callable(self._given) else frame  # a function may fill the same array again
 
 
 def _stored(frames: Frames, where: str, opened: Callable[[Path], Video]) -> Stored:
@@ -191,7 +192,15 @@ def _key(frames: Frames, place: str) -> object:
     """Return a key that two functions share if they read the same: a loop's variable has its last value in both."""
     if not isinstance(frames, FunctionType):
         return place
-    return frames.__code__, *map(id, (*(frames.__defaults__ or ()), *(frames.__closure__ or ())))
+    bound = (*(frames.__defaults__ or ()), *(frames.__kwdefaults__ or {}).values(), *(frames.__closure__ or ()))
+    return frames.__code__, *map(id, bound)
+
+
+def _variables(frames: Frames) -> list[tuple[CellType, object]]:
+    """Return the variables around a function, with their values now: a loop may change them."""
+    function = frames.func if isinstance(frames, functools.partial) else frames
+    cells = function.__closure__ if isinstance(function, FunctionType) else None
+    return [(cell, cell.cell_contents) for cell in cells or ()]
 
 
 class EpisodeDataset(RecordedDataset):
@@ -216,6 +225,7 @@ class EpisodeDataset(RecordedDataset):
         self.root, self.source, self.kind, self.given_task, self.notes = root, root.resolve().name, kind, task, notes
         opened, names, recorded = lru_cache(_FILES_AT_A_TIME)(Video), set[str](), dict[int, Recorded]()
         num_bytes, functions, rates = 0, dict[object, str](), list[float | None]()
+        variables: list[tuple[str, CellType, object]] = []
         for number, episode in enumerate(episodes):
             place, cameras = f"{where}: {episode.name}", dict[str, Stored]()
             require(f"{where}: name", episode.name not in names, "each once", f"{episode.name!r} again")
@@ -229,9 +239,17 @@ class EpisodeDataset(RecordedDataset):
                 same = functions.setdefault(_key(frames, own), own)
                 require(f"{place}: {camera}", same == own, "a function of its own", f"that of {same}: {_BY_FUNCTION}")
                 cameras[camera] = _stored(frames, own, opened)
+                variables += [(f"{place}: {camera}", *each) for each in _variables(frames)]
             missing = f"missing in {episode.name}"
             recorded[number] = Recorded(episode.name, place, episode.task, place, cameras, missing)
+        for camera_place, cell, value in variables:
+            expected = "a function whose variables keep their values"
+            require(camera_place, cell.cell_contents is value, expected, f"one that changed later: {_BY_FUNCTION}")
         require(where, bool(recorded), "at least one episode", "none")
         self.corrections = corrections.of_cameras(self.set_recorded(recorded))
         self.numbers = range(len(recorded))  # finds a number at once
         self.fps = next(filter(None, rates), None)
+
+    def read_episode(self, number: int) -> DatasetEpisode:
+        episode = super().read_episode(number)
+        return replace(episode, task=" ".join(episode.task.split()))

@@ -143,6 +143,15 @@ class Hdf5Dataset(RecordedDataset):
         faults = {each: fault for each, fault in faults.items() if fault and may_be_picture(found[each])}
         return Recorded(name, f"{place}/{self._folder}", task, f"{place}: {task_place}", cameras, missing, faults)
 
+    def length(self, number: int) -> int:
+        """Return the frame count of all shared cameras. Raises DatasetError if they differ."""
+        one = self.recorded[number]
+        shared = [each for each in self.cameras if each in one.cameras]
+        counts = {f"{self._folder}/{each}": one.cameras[each].count for each in shared}
+        got = ", ".join(f"{name} {count}" for name, count in counts.items())
+        require(f"{self.file}: data/{one.name}", len(set(counts.values())) < 2, "one length, above 0", got)
+        return next(iter(counts.values()), 0) or super().length(number)
+
     def place(self, episode: DatasetEpisode, camera: str) -> str:
         return f"{self.file}: data/{episode.name}/{self._folder}/{camera}"
 

@@ -70,6 +70,8 @@ def _expression(pattern: str) -> re.Pattern[str]:
     for place, part in enumerate(parts):
         in_name = length >= len(folders)
         number = f"(?P<number{place}>{NUMBER})" if is_numbered and in_name else "[^/]*"
+        if place > 1 and not parts[place - 1]:  # directly behind a field, which leaves it all digits
+            number = rf"(?<![\d.]){number}"
         known = {"{episode}": "(?P<episode>.+)", "{camera}": "(?P<camera>[^/]+)", "*": number}
         texts.append(known.get(part, re.escape(part)))
         length += len(part)
@@ -78,7 +80,7 @@ def _expression(pattern: str) -> re.Pattern[str]:
 
 def files_below(root: Path) -> Iterator[str]:
     """Yield all files below a folder as relative paths, without hidden ones and labels."""
-    for folder, folders, files in os.walk(root):
+    for folder, folders, files in os.walk(root, followlinks=True):
         folders[:] = sorted(name for name in folders if not name.startswith(".") and name != SIGNALS_FOLDER)
         below = Path(folder).relative_to(root)
         yield from ((below / name).as_posix() for name in sorted(files) if not name.startswith("."))

@@ -103,9 +103,11 @@ class RecordedDataset(CountedDataset):
 
     def length(self, number: int) -> int:
         fault: RewardError | None = None
-        for stored in self.recorded[number].cameras.values():
+        own = self.recorded[number].cameras
+        unused = self.unused_cameras(list(own))
+        for camera in sorted(own, key=lambda each: (each in unused, each not in self.cameras)):
             try:
-                return stored.count  # of the first camera that can be read
+                return own[camera].count  # of the first camera that can be read
             except RewardError as error:
                 fault = fault or error
         self.cameras_in([number])  # raises the reason if there is no camera
@@ -113,7 +115,7 @@ class RecordedDataset(CountedDataset):
 
     def read_episode(self, number: int) -> DatasetEpisode:
         one, length = self.recorded[number], self.length(number)
-        task = " ".join(self.given_task.of(one.task_place, one.task).split())
+        task = self.given_task.of(one.task_place, one.task)
         return DatasetEpisode(number, one.name, task, length, self.frames_before(number))
 
     def decoder(self, camera: str) -> str | None:
