@@ -23,7 +23,7 @@ def episodes(folder: Path) -> Iterator[Episode]:
             for name in sorted(opened, key=lambda name: (len(name), name)):
                 cameras = [each for each, stored in opened[f"{name}/obs/sensor_data"].items() if "rgb" in stored]
                 frames = {each: partial(pixels, file, f"{name}/obs/sensor_data/{each}/rgb") for each in cameras}
-                success = bool(opened[f"{name}/success"][-1])
+                success = bool(opened[f"{name}/success"][()].any())
                 yield Episode(f"{file.stem}/{name}", frames, fps=20, success=success)
 
 

@@ -29,7 +29,7 @@ def episodes(folder: Path) -> Iterator[Episode]:
             name = f"episode_{number}"
             frames = {camera: partial(pictures, file, f"{name}/observations/{camera}") for camera in CAMERAS}
             successes = opened.get(f"{name}/infos/success")  # with record_infos=True
-            yield Episode(name, frames, success=None if successes is None else bool(successes[-1]))
+            yield Episode(name, frames, success=None if successes is None else bool(successes[()].any()))
 
 
 def pictures(file: Path, place: str) -> Iterator[UInt8Array]:

@@ -18,6 +18,6 @@ def episodes(folder: Path) -> Iterator[Episode]:
     for file in sorted(folder.glob("*/data.json")):
         recording = json.loads(file.read_text(encoding="utf-8"))
         steps = [step["colors"] for step in recording["data"]]
-        frames = {camera: [file.parent / step[camera] for step in steps] for camera in steps[0]}
+        frames = {camera: [file.parent / step[camera] for step in steps] for camera in sorted(set().union(*steps))}
         about = recording.get("info", {}).get("image", {})
         yield Episode(file.parent.name, frames, task=recording["text"]["goal"], fps=about.get("fps"))

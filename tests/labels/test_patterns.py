@@ -68,6 +68,12 @@ LAYOUTS: dict[str, tuple[list[str], list[str], list[str], str]] = {  # files, ep
         ["video"],
         "{episode}.mp4",
     ),
+    "a word that ends in the number": (
+        [f"ep{n}/img/{side}{t:04d}.png" for n in range(2) for side in ("left", "right") for t in range(9, 12)],
+        ["ep0", "ep1"],
+        ["left", "right"],
+        "{episode}/img/{camera}*.png",
+    ),
 }
 
 

@@ -216,6 +216,27 @@ def last_of_a_loop(folder):
     for file in sorted(folder.glob("*.npy")):
         yield Episode(file.stem, {"front": lambda: np.load(file)}, task="stack")
 
+def changes_a_variable(folder):
+    for file in sorted(folder.glob("*.npy")):
+        yield Episode(file.stem, {camera: (lambda: np.load(file) if camera else None) for camera in ["front"]}, task="stack")
+
+def changes_for_a_partial(folder):
+    def load(camera):
+        return np.load(file)
+    for file in sorted(folder.glob("*.npy")):
+        yield Episode(file.stem, {"front": partial(load, "front")}, task="stack")
+
+def one_buffer(folder):
+    for file in sorted(folder.glob("*.npy")):
+        yield Episode(file.stem, {"front": partial(into_one_array, file)}, task="stack")
+
+def into_one_array(file):
+    clip = np.load(file)
+    buffer = np.empty_like(clip[0])
+    for frame in clip:
+        buffer[:] = frame
+        yield buffer
+
 def same_name(folder):
     for file in folder.glob("*.npy"):
         yield Episode("a", {"front": np.load(file)})
@@ -270,6 +291,11 @@ def test_label_and_evaluate_take_a_reader_by_its_name(folder: Path, capsys: pyte
     assert "2 episodes: 1 successes, 1 failures" in done.stdout
 
 
+def test_a_reader_may_fill_the_same_array_again(folder: Path) -> None:
+    dataset = open_dataset(folder, reader=named(folder, "one_buffer"))
+    np.testing.assert_array_equal(list(dataset.frames(dataset.episode(1), "front")), CLIPS[1])
+
+
 def test_an_actor_of_ray_calls_the_reader_by_its_name(folder: Path, output: Path) -> None:
     opening = pickle.loads(pickle.dumps({"reader": named(folder, "episodes")}))
     scorer = BrightnessScorer()
@@ -286,6 +312,8 @@ REFUSED: dict[str, str] = {
     "returns_nothing": r"got TypeError: 'NoneType' object is not iterable",
     "yields_paths": r"expected rfm_labels.Episode\(name, frames\) of each recording, got PosixPath",
     "last_of_a_loop": r"b: front: expected a function of its own, got that of a: front: give a function for each, with what",
+    "changes_a_variable": r"a: front: expected a function whose variables keep their values, got one that changed later: give",
+    "changes_for_a_partial": r"a: front: expected a function whose variables keep their values, got one that changed later: give",
     "same_name": "name: expected each once, got 'a' again",
     "nothing": "my_reader.py:nothing: expected at least one episode, got none",
     "one_camera_each": r"b: expected a camera as uint8 \[T, H, W, 3\], got a: missing in b\nto continue .*: --episodes 0$",

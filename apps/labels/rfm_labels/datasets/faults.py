@@ -17,7 +17,7 @@ from rfm_client.options import InvalidValueError, git_lfs_pointer
 from rfm_client.options import require as require_that
 
 _MOST_SHOWN = 20
-_OTHERS_CODE = (sysconfig.get_path("stdlib"), "site-packages", str(Path(__file__).parents[1]))
+_OTHERS_CODE = ("<frozen", sysconfig.get_path("stdlib"), "site-packages", str(Path(__file__).parents[1]))
 
 
 def listed(numbers: Iterable[int]) -> str:
@@ -99,8 +99,9 @@ def faults_of_reader(where: object) -> Iterator[None]:
         raise
     except Exception as error:
         lines = extract_tb(error.__traceback__)
-        last = [each for each in lines if not any(part in each.filename for part in _OTHERS_CODE)][-1:] or lines[-1:]
-        got = f"{type(error).__name__}: {error} ({Path(last[0].filename).name}, line {last[0].lineno})"
+        own = [each for each in lines if not any(part in each.filename for part in _OTHERS_CODE)]
+        got = f"{type(error).__name__}: {error}"
+        got += "".join(f" ({Path(each.filename).name}, line {each.lineno})" for each in own[-1:])
         raise DatasetError.at(where, "a reader that runs", got) from error
 
 

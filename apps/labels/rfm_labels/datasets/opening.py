@@ -128,7 +128,7 @@ def open_dataset(
     Of a dataset on the Hub, only the metadata are downloaded. ``Dataset.download`` fetches what episodes need.
 
     reader: function that yields the episodes of the folder, each an ``Episode``, or its name, ``FILE.py:FUNCTION``
-    videos: pattern for videos, pictures or arrays below the folder, such as ``{episode}/videos/{camera}.mp4`` or
+    videos: pattern for videos or pictures below the folder, such as ``{episode}/videos/{camera}.mp4`` or
         ``{episode}/colors/*_{camera}.jpg``
     task: task for episodes without their own
     override_task: True: use ``task`` for all episodes
@@ -185,6 +185,7 @@ def open_to_show(source: str) -> Dataset:
     """
     how, _, folder = source.partition("=")
     no_tasks, as_stored = TaskOverride(is_needed=False), AskedCorrections()
+    require("", bool(folder) or not (is_reader(how) or "{episode}" in how), f"{how}=FOLDER", source)
     if is_reader(how):
         return open_read(how, Path(folder).resolve(), no_tasks, as_stored)
     if "{episode}" in how:

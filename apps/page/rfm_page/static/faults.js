@@ -53,7 +53,7 @@ export function noDataset(retry) {
   return {
     kind: "empty",
     title: "No dataset yet",
-    text: "Restart the server with a LeRobot or RLDS folder or an HDF5 file, and look through its episodes here:",
+    text: "Restart the server with a dataset, and look through its episodes here:",
     command: remedies.dataset,
     buttons: [["Check now", retry]],
     note: BY_ITSELF,
