@@ -24,6 +24,7 @@ import stand_in_triton
 from commands import running_models
 from rfm.serve import probe, processes, status, supervisor, triton_server, watch
 from rfm.serve.processes import LOADING_DEAD_S, UNKNOWN, ModelProcesses
+from rfm.serve.repository_api import versions_of
 from rfm.serve.status import NO_REASON, Status, StatusServer
 from rfm.serve.supervisor import MOST, STEADY_S, CrashLoopError, FaultCount, GatewayProcess, Supervisor
 from rfm.serve.triton_server import TritonServer
@@ -235,6 +236,20 @@ def test_a_restart_serves_the_same_models_and_versions_and_no_newer_export(tmp_p
             assert "versions: 1" in stage.file(f"loaded-{model}").read_text()
         httpx.post(f"{stage.serving.endpoints.http_url}/v2/repository/models/a/load")
         assert stage.file("loaded-a").read_text() == config.read_text()  # a later load reads the repository's files
+
+
+@pytest.mark.parametrize(
+    ("entry", "has_failed"),
+    [
+        ({"version": "1", "state": "READY"}, False),
+        ({"version": "2", "state": "LOADING"}, False),  # a rollout goes on as soon as the port is open
+        ({"version": "2", "state": "UNAVAILABLE", "reason": "unloaded"}, False),
+        ({"version": "2", "state": "UNAVAILABLE", "reason": "no such file"}, True),
+        ({}, True),
+    ],
+)
+def test_a_start_fails_by_versions_that_could_not_be_loaded(entry: dict[str, str], has_failed: bool) -> None:
+    assert [version.has_failed for version in versions_of([{"name": "a", **entry}])] == [has_failed]
 
 
 def test_a_silent_gateway_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
