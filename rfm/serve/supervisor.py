@@ -25,6 +25,7 @@ STEADY_S = 60.0  # a process that ran longer is not in a crash loop
 MOST = 5  # restarts in a row; a call ends a process twice at most
 ASK_S = 1.0  # between requests to the gateway
 TRIES = 2  # unanswered requests in a row; a single one may mean that the machine stood still
+STILL_S = 2.0  # longest pause of all processes (docker pause) after which Triton may go on
 GATEWAY_PAUSE_S = 5.0  # between gateway starts
 logger = logging.getLogger(__name__)
 
@@ -170,8 +171,10 @@ class Supervisor:
             self._start()
             if self.gateway is not None and self._watch is not None:
                 self.gateway.start()
+            began_s = time.monotonic()
             while not self._is_to_stop.wait(POLL_S):
-                self._look()
+                self._look(time.monotonic() - began_s)
+                began_s = time.monotonic()
         except ServerStartError:
             if not self._is_to_stop.is_set():
                 raise
@@ -202,11 +205,17 @@ class Supervisor:
         urls = f"{ends.grpc_url}, {ends.http_url}, metrics at {ends.metrics_url}"
         logger.info("ready after %.0f s: %s at %s", self._start_s, ", ".join(self.server.models), urls)
 
-    def _look(self) -> None:
-        """Restart Triton or the gateway if it ended or has a fault. Raises CrashLoopError."""
+    def _look(self, waited_s: float) -> None:
+        """Restart Triton or the gateway if it ended or has a fault. Raises CrashLoopError.
+
+        waited_s: since the last look. After a pause, the model processes of Triton 2.51 end at the locks that they
+            share with it, and a request may get another's answer; so Triton is killed at once
+        """
         if self._watch is None:
             return
-        if self.server.exit_status is not None:
+        if waited_s > STILL_S:
+            self._start_again(TRITON, f"all processes stood still for {waited_s:.0f} s", counts=False)
+        elif self.server.exit_status is not None:
             self._start_again(TRITON, how_it_ended(self.server.exit_status))
         elif self._watch.fault is not None:
             self._start_again(*self._watch.fault, counts=not self._watch.is_of_load)

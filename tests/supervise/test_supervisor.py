@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -35,13 +35,14 @@ SILENT_S, HANG_S = 1.5, 1.5
 
 @pytest.fixture(autouse=True)
 def _in_a_hurry(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module, name, seconds in (
+    for module, name, value in (
         (supervisor, "POLL_S", 0.01),
+        (supervisor, "time", SimpleNamespace(monotonic=time.monotonic)),
         (watch, "LOOK_S", 0.02),
         (probe, "BROKEN_S", 0.1),
         (triton_server, "POLL_S", 0.02),
     ):
-        monkeypatch.setattr(module, name, seconds)
+        monkeypatch.setattr(module, name, value)
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,16 @@ def supervised(folder: Path, *models: str) -> Iterator[Supervised]:
         ended.result()
 
 
+def stand_still(stage: Supervised) -> None:
+    """Put the supervisor's clock forward while it waits, as a pause of all processes does."""
+    for _ in range(20):  # it may not wait at that moment
+        before = supervisor.time.monotonic
+        supervisor.time.monotonic = lambda before=before: before() + 20
+        with suppress(AssertionError):
+            wait_for(lambda: stage.serving.restarts("triton"), 0.3)
+            return
+
+
 Act = Callable[[Supervised], None]
 FAULTS: dict[str, tuple[Act, str, str]] = {
     "a process dies": (
@@ -102,6 +113,7 @@ FAULTS: dict[str, tuple[Act, str, str]] = {
     ),
     "a process stops": (lambda s: s.signal(signal.SIGSTOP, "a"), "a", r"a: process \d+ of it is stopped"),
     "triton dies": (lambda s: s.signal(signal.SIGKILL), "triton", "killed by SIGKILL"),
+    "all stand still": (stand_still, "triton", "all processes stood still for 20 s"),
     "requests fail": (lambda s: s.file("fails").touch(), "a", "a: it has failed at 3 probes in a row"),
     "triton is silent": (lambda s: s.signal(signal.SIGSTOP), "triton", f"no answer for {SILENT_S:g} s"),
     "requests hang": (lambda s: s.file("hangs").touch(), "a", f"a: it has answered nothing for {HANG_S:g} s"),
