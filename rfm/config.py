@@ -179,11 +179,8 @@ class ServeConfig(Settings):
         ConfigError.require_both(self, "grpc_certificate", "grpc_key")
         if self.grpc_client_ca is not None and self.grpc_certificate is None:
             raise ConfigError.of_two("grpc_client_ca", "needs", "grpc_certificate")
-        if self.grpc_certificate and not (self.grpc_client_ca or self.grpc_any_client or self.is_loopback):
-            expected = (
-                f"client certificates (--grpc-client-ca) at {self.host}, since TLS alone asks callers for nothing"
-            )
-            raise ConfigError.at("grpc_certificate", expected, "none", "--grpc-any-client serves everyone")
+        if self.grpc_any_client and self.grpc_certificate is None:
+            raise ConfigError.of_two("grpc_any_client", "needs", "grpc_certificate")
 
     @property
     def is_loopback(self) -> bool:

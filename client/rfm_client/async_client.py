@@ -235,7 +235,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         infos: dict[Part, list[ModelInfo]] = {}
         for part, name in self.model_names.items():
             with suppress(ModelNotFoundError):
-                infos[part] = await self._servers.model_infos(name, deadline)
+                infos[part] = await self._scorer.model_infos(name, deadline)
         return infos
 
     def stop_retrying(self) -> None:

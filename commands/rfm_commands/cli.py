@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import typer
 
 from rfm.config import ExportConfig, ServeConfig
-from rfm.serve.access import Endpoints, new_key, take_key
+from rfm.serve.access import NO_KEY, Endpoints, new_key, take_key
 from rfm.serve.installation import ServerStartError, find_installation, has_gpu, without_gpus
 from rfm.serve.supervisor import CrashLoopError, GatewayProcess, Supervisor
 from rfm.serve.triton_server import TritonServer, short_spin
@@ -200,6 +200,11 @@ def serve(
         )
         beside = None if config.gateway.port is None else _beside(server, config, gateway_given)
         found = doors(endpoints, more_arguments, config.serve.status_port, beside, os.environ)
+        asked = config.serve
+        is_open = asked.grpc_certificate is not None and found["gRPC"][1] == NO_KEY
+        if is_open and not (asked.grpc_any_client or asked.is_loopback):
+            expected = f"client certificates (--grpc-client-ca) at {asked.host}, since TLS alone asks for nothing"
+            fail(f"--grpc-certificate: expected {expected}, got none; --grpc-any-client serves everyone")
         screen = ServeScreen(folder, endpoints, found, log) if log is not None and sys.stderr.isatty() else None
         supervisor = Supervisor(
             server,
@@ -212,11 +217,11 @@ def serve(
         if screen is not None:
             screen.show_start()
         else:
-            kinds = dict.fromkeys(asks for _, asks in found.values())
-            ports = {kind: ", ".join(name for name, (_, asks) in found.items() if asks == kind) for kind in kinds}
+            kinds = dict.fromkeys(needs for _, needs in found.values())
+            ports = {kind: ", ".join(name for name, (_, needs) in found.items() if needs == kind) for kind in kinds}
             if not has_gpu():
                 logger.info("no GPU: Triton's lines about CUDA, streams and pinned memory are no faults")
-            logger.info("%s", "; ".join(f"asks callers for {kind}: {names}" for kind, names in ports.items()))
+            logger.info("%s", "; ".join(f"{kind}: {names}" for kind, names in ports.items()))
         _run(supervisor, log)
 
 
@@ -290,7 +295,6 @@ def _config(file: Path | None, **options: OptionValues[Any]) -> Config:
 
 
 def main() -> None:
-    """Entry point of the ``rfm`` console script."""
+    """Run the command."""
     os.environ.update(short_spin(os.environ))  # before PyTorch is imported
-    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # as rfm-client does
     app()

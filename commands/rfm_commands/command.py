@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -40,20 +41,21 @@ class RfmCommands(command.Commands):
 
 @contextmanager
 def timed_steps() -> Iterator[Callable[[str], None]]:
-    """Yield a function that begins a step. A terminal shows each step with its time; standard error else nothing."""
-    from rich.console import Console
-    from rich.progress import Progress, TextColumn, TimeElapsedColumn
+    """Yield a function that begins a step. Each step's begin, and at its end its seconds, go to standard error."""
+    begun: list[tuple[str, float]] = []
 
-    console = Console(stderr=True)
-    columns = TextColumn(f"{RfmCommand.program}: {{task.description}}"), TimeElapsedColumn()
-    with Progress(*columns, console=console, disable=not console.is_terminal) as steps:
+    def end() -> None:
+        for step, began_s in begun:
+            say(f"{step}: {time.monotonic() - began_s:.0f} s")
+        begun.clear()
 
-        def begin(step: str) -> None:
-            for task in steps.task_ids:
-                steps.stop_task(task)
-            steps.add_task(step, total=None)
+    def begin(step: str) -> None:
+        end()
+        say(f"{step} ...")
+        begun.append((step, time.monotonic()))
 
-        yield begin
+    yield begin
+    end()
 
 
 def say(line: str) -> None:

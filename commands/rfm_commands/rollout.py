@@ -133,7 +133,7 @@ class Rollout:
 
     def _go_back(self, old: Configs, served: Mapping[str, Sequence[int]]) -> str:
         """Serve the old versions again. Return the outcome in words."""
-        self.report(f"going back; a server that is started again has {RETURN_S:.0f} s")
+        self.report(f"going back; waits up to {RETURN_S:.0f} s for a server that restarts")
         ends_s = time.monotonic() + RETURN_S
         failed: dict[str, str | None] = dict.fromkeys(reversed(list(served)))  # the ensemble before its parts
         while True:

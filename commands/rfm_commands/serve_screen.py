@@ -58,7 +58,7 @@ def doors(
     gateway: GatewayConfig | None,
     environment: Mapping[str, str],
 ) -> dict[str, tuple[str, str]]:
-    """Return the URL of each port, and what it asks callers for, by the port's name.
+    """Return the URL of each port, and what callers need, by the port's name.
 
     more_arguments: further tritonserver arguments
     gateway: the gateway beside the server; None: no gateway
@@ -96,7 +96,7 @@ class ServeScreen:
         """Show the addresses, models and device, and what to try next."""
         rows = {
             "models": f"{self._models()}, on {self._devices()}",
-            **{name: f"{url} (asks for {asks})" for name, (url, asks) in self.doors.items()},
+            **{name: f"{url} ({needs})" for name, (url, needs) in self.doors.items()},
             "log": f"{self.log} (lines of Triton and the models)",
         }
         lines = [f"  {name:9}{value}" for name, value in rows.items()]

@@ -28,7 +28,7 @@ _GRPC_PREFIX = "triton-grpc-protocol-"  # Triton puts it before the header name
 _RESTRICTED = "model-repository,logging,trace"
 _RESTRICTIONS = {"HTTP": "http-restricted-api", "gRPC": "grpc-restricted-protocol"}  # tritonserver's options
 _SCORING = "inference"  # the restricted API
-NO_KEY, KEY, CERTIFICATE = "no key", "a key", "a client certificate"  # what a port asks its callers for
+NO_KEY, KEY, CERTIFICATE = "no key needed", "needs a key", "needs a client certificate"  # what a port's callers need
 _RANDOM_BYTES = 32
 _VISIBLE = re.compile("[!-~]*")  # characters that a header can carry unchanged
 
@@ -175,7 +175,7 @@ class Endpoints:
         return f"http://{in_url(self.host)}:{self.metrics_port}/metrics"
 
     def doors(self, more_arguments: Sequence[str] = ()) -> dict[str, tuple[str, str]]:
-        """Return the URL of each port, and what it asks callers for, by the port's name.
+        """Return the URL of each port, and what callers need, by the port's name.
 
         more_arguments: further tritonserver arguments, which may restrict scoring
         """

@@ -71,7 +71,7 @@ def find_installation(executable: Path | None = None) -> Installation:
 
 
 def has_gpu() -> bool:
-    """True if this machine has a GPU that CUDA can use."""
+    """True if there is a device of NVIDIA's driver, also under WSL 2."""
     return any(map(os.path.exists, _GPU_DEVICES))
 
 

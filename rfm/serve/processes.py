@@ -129,7 +129,7 @@ class ModelProcesses:
         for pid in sorted(before.keys() & self._since_s.keys()):
             if is_settled or now_s - before[pid] >= LOADING_DEAD_S:
                 how = _how_it_died(pid) if states[pid] == psutil.STATUS_ZOMBIE else ""
-                return self._models[pid], f"process {pid} of it is {_STATES[states[pid]]}{how}"
+                return self._models[pid], f"its process {pid} is {_STATES[states[pid]]}{how}"
         return None
 
     @property
@@ -215,7 +215,10 @@ class Claim:
 
     def show(self, repository: Path) -> None:
         """Let Triton read the models in this folder from now on. Raises OSError."""
+        if self.models.is_symlink() and self.models.readlink() == repository.absolute():
+            return
         new = self.folder / "new"
+        new.unlink(missing_ok=True)
         new.symlink_to(repository.absolute())
         new.rename(self.models)
 

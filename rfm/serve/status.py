@@ -27,6 +27,7 @@ class Status:
     def __init__(self, more: Callable[[str], Mapping[str, Any]] = lambda _model: {}) -> None:
         self._more = more
         self._reasons: Mapping[str, str] = {}
+        self._details = ""  # behind each reason
         self._registry = CollectorRegistry()
         gauge = partial(Gauge, registry=self._registry)
         self._ready = gauge("rfm_serve_ready", "1: the model is ready.", ["model"])
@@ -37,6 +38,7 @@ class Status:
 
     def record(self, reasons: Mapping[str, str]) -> None:
         """Record every model's state. reasons: why each model is not ready, or NO_REASON"""
+        self._details = ""
         gone, before, self._reasons = self._reasons.keys() - reasons.keys(), self._reasons, dict(reasons)
         for model, reason in before.items():
             if reason not in (NO_REASON, reasons.get(model)):
@@ -49,9 +51,10 @@ class Status:
         for model in gone:
             self._ready.remove(model)
 
-    def record_down(self, reason: str) -> None:
-        """Record why no model is ready."""
+    def record_down(self, reason: str, details: str = "") -> None:
+        """Record why no model is ready. details: for ``/ready`` alone, since each reason is a metric's label"""
         self.record(dict.fromkeys(self._reasons, reason))
+        self._details = details
 
     @property
     def ready(self) -> tuple[bool, dict[str, Any]]:
@@ -59,7 +62,7 @@ class Status:
         reasons = self._reasons
         is_ready = bool(reasons) and all(reason == NO_REASON for reason in reasons.values())
         models = {
-            model: {"ready": reason == NO_REASON, "reason": reason, **self._more(model)}
+            model: {"ready": reason == NO_REASON, "reason": reason + self._details, **self._more(model)}
             for model, reason in reasons.items()
         }
         return is_ready, {"ready": is_ready, "models": models}

@@ -236,7 +236,7 @@ class Supervisor:
             self._close_watch()
             reason = why if what == TRITON else f"{what}: {why}"
             again = f"{TRITON} is started again: {reason}; all models load, which took {self._start_s:.0f} s last time"
-            self._status.record_down(again)
+            self._status.record_down(f"{TRITON} is started again", again.removeprefix(f"{TRITON} is started again"))
             self.server.kill()
             self.server.stop()
             if counts:

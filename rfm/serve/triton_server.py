@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import mmap
 import os
 import re
@@ -22,6 +23,7 @@ from rfm.serve.probe import NO_ANSWER, Http
 from rfm.serve.processes import (
     EXIT_TIMEOUT_S,
     NEEDS_ROOM,
+    SHARED_MEMORY,
     UNKNOWN,
     Claim,
     ModelProcesses,
@@ -190,6 +192,10 @@ class TritonServer:
                 self.stop()
                 self._start_ready(served)
         except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise ServerStartError.at(
+                    SHARED_MEMORY, "room for a server's files", error.strerror, NEEDS_ROOM
+                ) from error
             raise ServerStartError.at(error.filename, "to be readable", error.strerror) from error
 
     def stop(self) -> None:

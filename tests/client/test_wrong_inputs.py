@@ -126,7 +126,7 @@ FAILURES = {
     ),
     "rfm serve repository --host 10.0.0.5 --grpc-certificate key.pem --grpc-key key.pem": (
         *(1, "--grpc-certificate: expected client certificates (--grpc-client-ca) at 10.0.0.5, "),
-        "since TLS alone asks callers for nothing, got none; --grpc-any-client serves everyone",
+        "since TLS alone asks for nothing, got none; --grpc-any-client serves everyone",
     ),
     "rfm serve repository --gateway-port FREE_PORT --gateway-dataset nope": (1, f"--gateway-dataset: {DATASET} nope"),
     "rfm serve repository --config mistake.yaml": (

@@ -64,7 +64,7 @@ def test_a_model_process_that_dies_or_hangs_is_restarted_and_no_call_is_lost(tmp
             assert served.restarts(MODEL) == number
         assert served.reasons() == {MODEL: NO_REASON}
         assert served.metric("rfm_serve_start_seconds") > 0
-    assert f"{MODEL}: process {killed} of it is dead (killed by SIGKILL); all models load, " in served.log.read_text()
+    assert f"{MODEL}: its process {killed} is dead (killed by SIGKILL); all models load, " in served.log.read_text()
     assert (callers.lost, callers.wrong) == ([], 0)
     assert f"Timeout (0:00:0{HANG_S})!" in served.log.read_text()
 

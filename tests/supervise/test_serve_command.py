@@ -95,7 +95,7 @@ def test_the_committed_repository_is_served_with_a_gateway_until_a_signal(
             _, log = process.communicate(timeout=EXIT_S)
     assert process.returncode == 0
     assert f"at grpc://[::1]:{grpc}, http://[::1]:{http}, metrics at http://[::1]:{metrics}/metrics\n" in log
-    assert "asks callers for no key: gRPC, HTTP, metrics, status; asks callers for a key: page\n" in log
+    assert "no key needed: gRPC, HTTP, metrics, status; needs a key: page\n" in log
     assert has_gpu() != ("]: no GPU: Triton's lines about " in log)
     assert has_gpu() or not re.search("NVML|DCGM|Unable to allocate pinned", log)
     assert f"answers requests at {page}/\n" in log
@@ -122,8 +122,8 @@ def test_a_terminal_shows_one_screen_and_a_file_the_lines_of_triton(
     assert shown[0] == f"rfm serve: loading rfm, rfm_encoder, rfm_frames from {repository} ..."
     for line in (
         "  models   rfm 1, rfm_encoder 1, rfm_frames 1, on the CPU",
-        f"  gRPC     {endpoints.grpc_url} (asks for no key)",
-        f"  page     http://127.0.0.1:{gateway}/ (asks for no key)",
+        f"  gRPC     {endpoints.grpc_url} (no key needed)",
+        f"  page     http://127.0.0.1:{gateway}/ (no key needed)",
         f"  log      {log} (lines of Triton and the models)",
     ):
         assert line in shown

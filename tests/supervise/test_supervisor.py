@@ -37,7 +37,7 @@ SILENT_S, HANG_S = 1.5, 1.5
 def _in_a_hurry(monkeypatch: pytest.MonkeyPatch) -> None:
     for module, name, value in (
         (supervisor, "POLL_S", 0.01),
-        (supervisor, "time", SimpleNamespace(monotonic=time.monotonic)),
+        (supervisor, "time", SimpleNamespace(monotonic=time.monotonic, sleep=time.sleep)),
         (watch, "LOOK_S", 0.02),
         (probe, "BROKEN_S", 0.1),
         (triton_server, "POLL_S", 0.02),
@@ -109,9 +109,9 @@ FAULTS: dict[str, tuple[Act, str, str]] = {
     "a process dies": (
         lambda s: s.signal(signal.SIGKILL, "a"),
         "a",
-        r"a: process \d+ of it is dead \(killed by SIGKILL\)",
+        r"a: its process \d+ is dead \(killed by SIGKILL\)",
     ),
-    "a process stops": (lambda s: s.signal(signal.SIGSTOP, "a"), "a", r"a: process \d+ of it is stopped"),
+    "a process stops": (lambda s: s.signal(signal.SIGSTOP, "a"), "a", r"a: its process \d+ is stopped"),
     "triton dies": (lambda s: s.signal(signal.SIGKILL), "triton", "killed by SIGKILL"),
     "all stand still": (stand_still, "triton", "all processes stood still for 20 s"),
     "requests fail": (lambda s: s.file("fails").touch(), "a", "a: it has failed at 3 probes in a row"),
@@ -161,7 +161,7 @@ def test_faults_in_a_row_end_the_supervisor(tmp_path: Path, monkeypatch: pytest.
         assert httpx.get(f"{stage.serving.status_url}/live").status_code == 200
         assert httpx.get(f"{stage.serving.status_url}/other").status_code == 404
         stage.file("deadly-a").touch()
-        last = r"a: process \d+ of it is dead"
+        last = r"a: its process \d+ is dead"
         wanted = f"^triton: expected to run, got 2 faults in a row; the last: {last}$"
         with pytest.raises(CrashLoopError, match=wanted):
             stage.ended.result()

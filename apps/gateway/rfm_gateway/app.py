@@ -231,9 +231,9 @@ def _handlers() -> dict[Any, Any]:
     async def without_room(request: Request, error: OSError) -> JSONResponse:
         if error.errno not in _NO_ROOM and _NO_FOLDER not in str(error):
             raise error
-        folder = tempfile.tempdir or "its temporary folders"  # None: not found
+        folder = f"{tempfile.tempdir} of the gateway" if tempfile.tempdir else "a temporary folder of the gateway"
         remedy = "try again, or whoever runs the gateway makes room there or names another folder in TMPDIR"
-        detail = f"body: expected room in {folder} of the gateway, got {error.strerror}: {remedy}"
+        detail = f"body: expected room in {folder}, got {error.strerror}: {remedy}"
         return refuse(request.scope, 503, detail, {**RETRY_AFTER, **_CLOSE})
 
     async def unexpected(request: Request, error: Exception) -> JSONResponse:

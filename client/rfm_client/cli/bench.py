@@ -26,6 +26,7 @@ from rfm_client.frames.sampling import Sampling
 
 WARM_UP_S = 2.0
 EPISODE_STEPS = 100  # an episode keeps its frames in memory
+MOST_OPEN = 20  # unanswered steps per robot; further steps count as failed, so that frames do not fill the memory
 ENOUGH = 0.99  # share of steps in time for a load that is held
 
 Ask: TypeAlias = Callable[[], "Future[Any]"]
@@ -114,6 +115,9 @@ def measure(client: RewardClient, load: Load) -> Measured:
     for due_s, robot in load.due():
         num_steps += 1
         left_s = began_s + due_s - time.perf_counter()
+        if num_steps - answers.qsize() > MOST_OPEN * load.robots:
+            answers.put((due_s, math.inf, TimeoutError("not sent: too many earlier steps are unanswered")))
+            continue
         if left_s < -client.timeout_s:
             answers.put((due_s, math.inf, TimeoutError("not sent in time: divide the robots among several machines")))
             continue

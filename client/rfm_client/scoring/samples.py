@@ -160,6 +160,13 @@ class SampleScorer:
                 raise
         return self._infos[model]
 
+    async def model_infos(self, model: str, deadline: Deadline) -> list[ModelInfo]:
+        """Return each server's description of ``model``, and remember the first. Raises RewardError."""
+        self._infos.pop(model, None)
+        infos = await self._servers.model_infos(model, deadline)
+        self._infos[model] = infos[0]
+        return infos
+
     def tell_of_length(self, num_frames: int, info: ModelInfo) -> None:
         """Log the first trajectory that has more frames than in training. Its scores are unreliable."""
         limit = info.max_frames

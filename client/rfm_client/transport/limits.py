@@ -59,7 +59,7 @@ class Deadline:
     def exceeded(self, where: str = "") -> DeadlineExceededError:
         """Return the error for a call that ran out of time at the server ``where``."""
         passed_s = self.passed_s
-        late = f"; {passed_s:.0f} s have passed, since this process itself stood still"
+        late = f"; {passed_s:.0f} s have passed, as this process was stopped, or busy with other work"
         text = f"no answer within {self.timeout_s:g} s{late * (passed_s > self.timeout_s + LATE_S)}"
         return DeadlineExceededError(f"{where}: {text}" if where else text)
 

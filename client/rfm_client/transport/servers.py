@@ -258,7 +258,7 @@ class Servers:
         except ModelNotFoundError as error:
             if model not in self._answered:
                 raise
-            why = "it answered before, so the server restarts or loads another version: try again"
+            why = "it answered before: the server restarts, loads another version, or has unloaded it: try again"
             raise ServerUnavailableError(f"{error.fault or error.message}: {why}") from error
         self._answered.add(model)
         return answer
