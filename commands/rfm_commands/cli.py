@@ -295,6 +295,6 @@ def _config(file: Path | None, **options: OptionValues[Any]) -> Config:
 
 
 def main() -> None:
-    """Run the command."""
+    """Run ``rfm`` with the words of the command line."""
     os.environ.update(short_spin(os.environ))  # before PyTorch is imported
     app()

@@ -147,7 +147,8 @@ def test_bench_tells_whether_the_server_holds_a_load(
     result = invoke("bench", "--url", demo_server.grpc_url, *words, "--json", "-")
     assert (result.exit_code, result.stderr) == (ExitCode.OK if is_held else ExitCode.FAILED, "")
     told = json.loads(result.stdout)
-    assert (told["held"], told["failures"]) == (is_held, {})
+    assert told["held"] is is_held
+    assert set(told["failures"]) <= (set() if is_held else {"not sent: too many earlier steps are unanswered"})
     assert told["asked"] == ("frames" if "--use-frames" in words else "embeddings")
     assert told["steps"] in range(steps, steps + 4)  # robots begin within a step
     assert 0 <= told["in_time"] <= 1

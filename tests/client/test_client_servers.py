@@ -122,7 +122,7 @@ def test_a_model_that_answered_before_and_is_missing_is_waited_for() -> None:
         stand.error = None
         client.progress(SEEN)
         stand.error = LACKING
-        with pytest.raises(ServerUnavailableError, match=r"^lacking: it answered before, .*: try again"):
+        with pytest.raises(ServerUnavailableError, match=r"^lacking: it answered before: .*: try again"):
             client.progress(SEEN, timeout_s=0.3)
         waiting = client.submit(ProgressSample(SEEN))
         wait_for(lambda: stand.asked["infer"] > 6)

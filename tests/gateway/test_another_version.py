@@ -78,7 +78,7 @@ def test_a_model_that_is_missing_after_a_restart_is_no_fault_of_the_caller(model
         triton.served = {"rfm", "rfm_encoder", "rfm_frames"} - {model}
         for response in (client.get("/model_info"), ask_json(client, [progress(trajectory)])):
             assert re.fullmatch(
-                rf"{model}: it answered before, .*: try again( \(request .*\))?", failure(response, 503)
+                rf"{model}: it answered before: .*: try again( \(request .*\))?", failure(response, 503)
             )
             assert response.headers["Retry-After"] == "1"
         wait_for(lambda: client.get("/health").status_code == 503)  # the earlier state is reported for another second

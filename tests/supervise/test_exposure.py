@@ -85,11 +85,11 @@ def test_files_of_tls_are_read_before_anything_starts(papers: Papers) -> None:
 
 ASKS: dict[str, tuple[bool, list[str], dict[str, str]]] = {
     "nothing": (False, [], {}),
-    "client certificates": (True, [], {"gRPC": "a client certificate"}),
+    "client certificates": (True, [], {"gRPC": "needs a client certificate"}),
     "keys of tritonserver": (
         False,
         ["--grpc-restricted-protocol=health,inference:a=b", "--http-restricted-api=inference:a=b"],
-        {"gRPC": "a key", "HTTP": "a key"},
+        {"gRPC": "needs a key", "HTTP": "needs a key"},
     ),
     "a key for health alone": (False, ["--grpc-restricted-protocol=health:inference=b"], {}),
 }
@@ -102,11 +102,11 @@ def test_the_screen_says_what_each_port_asks_for_and_shows_it_in_the_next_step(
     tls = GrpcTls(papers.certificate, papers.key, papers.ca) if has_tls else None
     endpoints, gateway = replace(Endpoints.free(), grpc_tls=tls), GatewayConfig(host="127.0.0.1", port=8100)
     found = doors(endpoints, more, 8003, gateway, {"RFM_GATEWAY_API_KEY": "open sesame"})
-    of_all = {**dict.fromkeys(("gRPC", "HTTP", "metrics", "status"), "no key"), "page": "a key"}
+    of_all = {**dict.fromkeys(("gRPC", "HTTP", "metrics", "status"), "no key needed"), "page": "needs a key"}
     assert {name: kind for name, (_, kind) in found.items()} == {**of_all, **asks}
     ServeScreen(REPOSITORY, endpoints, found, Path("triton.log")).show_ready()
     shown = capsys.readouterr().err
-    assert f"  gRPC     {endpoints.grpc_url} (asks for {asks.get('gRPC', 'no key')})\n" in shown
+    assert f"  gRPC     {endpoints.grpc_url} ({asks.get('gRPC', 'no key needed')})\n" in shown
     own = " --ca-file AUTHORITY.pem --client-certificate CERTIFICATE.pem --client-key KEY.pem" * has_tls
     assert f"score VIDEO --task TASK --url {endpoints.grpc_url}{own}\n" in shown
 

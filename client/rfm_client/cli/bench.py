@@ -115,13 +115,13 @@ def measure(client: RewardClient, load: Load) -> Measured:
     for due_s, robot in load.due():
         num_steps += 1
         left_s = began_s + due_s - time.perf_counter()
-        if num_steps - answers.qsize() > MOST_OPEN * load.robots:
-            answers.put((due_s, math.inf, TimeoutError("not sent: too many earlier steps are unanswered")))
-            continue
         if left_s < -client.timeout_s:
             answers.put((due_s, math.inf, TimeoutError("not sent in time: divide the robots among several machines")))
             continue
         time.sleep(max(left_s, 0.0))
+        if num_steps - answers.qsize() > MOST_OPEN * load.robots:
+            answers.put((due_s, math.inf, TimeoutError("not sent: too many earlier steps are unanswered")))
+            continue
         asks[robot]().add_done_callback(partial(note, due_s))
     outcomes = [each for each in (answers.get() for _ in range(num_steps)) if each[0] >= WARM_UP_S]
     answered = [(due_s, answered_s) for due_s, answered_s, error in outcomes if error is None]
