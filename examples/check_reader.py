@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from rfm_labels import DatasetError, open_dataset
+from rfm_labels.datasets.readers import read_episodes
 
 
 def check(reader: str, folder: Path, num_decoded: int = 3) -> list[str]:
@@ -20,6 +21,7 @@ def check(reader: str, folder: Path, num_decoded: int = 3) -> list[str]:
     num_decoded: of so many episodes, spread over all of them, all frames are decoded
     """
     first, second = (open_dataset(folder, reader=reader, task="any", override_task=True) for _ in range(2))
+    told = list(read_episodes(reader, folder))
     names = [[episode.name for episode in dataset.episodes] for dataset in (first, second)]
     if names[0] != names[1]:
         raise DatasetError.at(reader, f"the same episodes each time: {names[0]}", names[1])
@@ -34,11 +36,15 @@ def check(reader: str, folder: Path, num_decoded: int = 3) -> list[str]:
             shown = [np.stack(list(dataset.frames(episode, camera))) for dataset in (first, first, second)]
             if not (np.array_equal(shown[0], shown[1]) and np.array_equal(shown[0], shown[2])):
                 raise DatasetError.at(f"{episode.name}: {camera}", "the same frames each time", "others")
-        lines.append(f"{episode.name}: {episode.num_frames} frames of {', '.join(cameras)}")
+        own = told[episode.index]
+        about = f"task {own.task!r}, fps {own.fps}, success {own.success}"
+        lines.append(f"{episode.name}: {episode.num_frames} frames of {', '.join(cameras)}; {about}")
     return lines
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit("usage: python examples/check_reader.py my_reader.py:episodes FOLDER")
     try:
         print(*check(sys.argv[1], Path(sys.argv[2])), sep="\n")
     except DatasetError as error:

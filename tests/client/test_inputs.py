@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+import tarfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_args
@@ -262,7 +263,10 @@ def test_pictures_are_no_video(tmp_path: Path, kind: str) -> None:
     one, *others = (Image.fromarray(np.full((32, 48, 3), 80 * t, np.uint8)) for t in range(3))
     one.save(tmp_path / "one", kind)
     one.save(tmp_path / "several", kind, **({} if kind == "jpeg" else {"save_all": True, "append_images": others}))
-    for name in ("one", "several"):
+    with tarfile.open(tmp_path / "tar", "w") as packed:  # FFmpeg finds the JPEG files in it
+        packed.add(tmp_path / "one", "0")
+        packed.add(tmp_path / "several", "1")
+    for name in ("one", "several", *(["tar"] if kind == "jpeg" else [])):
         refused = r"expected a video file \(make one of pictures: ffmpeg .*\), got a picture file, or several"
         with pytest.raises(InvalidSampleError, match=rf"^video: {refused}"):
             load_trajectory(tmp_path / name)

@@ -29,6 +29,7 @@ from rfm_labels.plan import Plan
 from rfm_labels.writing import (
     EPISODES_KEY,
     IDENTITY,
+    NAMES_KEY,
     PROGRESS_ENDING,
     PROVENANCE_KEY,
     SIGNAL_NAMES,
@@ -122,6 +123,12 @@ def read_blank(file: Path) -> BlankCameras:
 def read_provenance(file: Path) -> dict[str, Any]:
     """Read a label file's writer, dataset and recipe, as far as recorded. Raises DatasetError."""
     return _provenance(_metadata(file))
+
+
+def read_names(file: Path) -> dict[int, str]:
+    """Read the names of a label file's episodes by number; empty for LeRobot's. Raises DatasetError."""
+    names = parsed_object(_metadata(file).get(NAMES_KEY))
+    return {int(number): str(name) for number, name in names.items()}
 
 
 def _provenance(metadata: Mapping[bytes, bytes]) -> dict[str, Any]:

@@ -27,7 +27,9 @@ _COSTS = {"-1": False, "0": True}  # rewards of -1 until success
 Stored: TypeAlias = Mapping[int, tuple[str, Sequence[Any]]]  # place for messages, and one or T values, by episode
 
 
-def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool | None]:
+def read_outcomes(
+    source: str, dataset: Path | None = None, names: Mapping[int, str] | None = None
+) -> dict[int, bool | None]:
     """Return each episode's outcome by number; None: unknown. Raises DatasetError.
 
     An episode succeeds if any of its frames does, as in LeRobot's evaluation. Values: true, false, 1, 0; rewards of 1
@@ -36,10 +38,17 @@ def read_outcomes(source: str, dataset: Path | None = None) -> dict[int, bool | 
     source: a CSV file with the columns ``episode`` and ``success``; a LeRobot column, per frame or per episode; an
         attribute or array of each demonstration in an HDF5 file; or a reader, ``FILE.py:FUNCTION``
     dataset: the LeRobot folder, the HDF5 file, or the folder of the reader's recordings
+    names: of the labelled episodes, by number, which a reader must give in the same order; None: unchecked
     """
     if is_reader(source):
         require("outcome", dataset is not None, "the folder of the recordings with a reader", "none")
-        return {number: each.success for number, each in enumerate(read_episodes(source, dataset or Path()))}
+        outcomes = {}
+        for number, episode in enumerate(read_episodes(source, dataset or Path())):
+            labelled = (names or {}).get(number, episode.name)
+            remedy = "label again, and yield new recordings last"
+            require(f"outcome: episode {number}", episode.name == labelled, labelled, f"{episode.name}: {remedy}")
+            outcomes[number] = episode.success
+        return outcomes
     if Path(source).suffix.lower() == ".csv":
         return _outcomes(_SUCCESS, _of_csv(Path(source)))
     if dataset is not None and is_hdf5(dataset):

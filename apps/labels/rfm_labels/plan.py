@@ -240,6 +240,11 @@ class Plan:
         """Frames in all episodes."""
         return sum(item.episode.num_frames for item in self.items)
 
+    @property
+    def episodes(self) -> list[DatasetEpisode]:
+        """The episodes to label."""
+        return [item.episode for item in self.items]
+
     def digests(self) -> dict[str, str]:
         """Return item digests by episode number."""
         return {str(item.episode.index): item.digest for item in self.items}

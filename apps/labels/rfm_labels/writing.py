@@ -49,6 +49,7 @@ PROGRESS_ENDING = "_progress.parquet"
 PROVENANCE_KEY = b"rfm.provenance"
 SIGNALS_PROVENANCE_KEY = b"lerobot.reward_scoring.provenance"
 EPISODES_KEY = b"rfm.episodes"  # digest per episode: a later run compares them to see whether the labels still hold
+NAMES_KEY = b"rfm.names"  # by number, of episodes that have names of their own
 FILL_KEY = b"rfm.progress_sparse_fill"  # absent if the model skipped no frame
 SIGNAL_NAMES = {**{name: name for name in SCORES}, SUCCESS: "success_probability", REMAINING: "remaining_time_s"}
 _POTENTIAL, _IS_SCORED, _ADVANTAGE = "potential", "is_inference_frame", "advantage"
@@ -290,7 +291,7 @@ def _with_totals(labels: Any, plan: Plan) -> Any:
 def _advantages(progress: Float32Array, plan: Plan) -> Float32Array:
     """Return the advantages of all frames, float32 [T], each within its stretch of frames with one task."""
     assert plan.horizon is not None
-    steps = most_steps(item.episode for item in plan.items)
+    steps = most_steps(plan.episodes)
     stretches = [stretch for item in plan.items for stretch in item.episode.stretches]
     starts = np.cumsum([0, *(num_frames for _, num_frames in stretches)])
     return np.concatenate(
@@ -373,6 +374,8 @@ def write_labels(labels: Any, plan: Plan, progress: Sequence[Path], signals: Seq
     forms = [(path, _progress_form(plan, columns)) for path in progress]
     forms += [(path, _signals_form(plan, columns, name)) for path in signals]
     shared = {EPISODES_KEY: canonical_json(plan.digests()), **(labels.schema.metadata or {})}
+    if names := {str(each.index): each.name for each in plan.episodes if each.name != f"episode {each.index}"}:
+        shared[NAMES_KEY] = canonical_json(names)
     labels = _with_totals(labels, plan)
     for path, _ in forms:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -30,6 +30,11 @@ _SAME_MATRIX = {6: _BT601, 10: _BT2020}  # other numbers for the same matrix
 _BITS = 8  # most bits in a grey video's only channel; depth maps have more
 _TS_SYNC, _TS_PACKETS = 0x47, ((188, 0), (192, 4))  # first byte, its offset by packet length (ISO 13818-1, Blu-ray)
 _PICTURES = (b"\xff\xd8\xff", b"\x89PNG", b"II*\0", b"MM\0*")  # first bytes: JPEG, PNG, TIFF
+_RAW_PICTURES = "mjpeg"  # FFmpeg's name for JPEG files in one, also for a tar of them
+_NO_VIDEO = (
+    "a video file (make one of pictures: ffmpeg -i IN OUT.mp4)",
+    "a picture file, or several in one (raw Motion JPEG, animated PNG, a tar)",
+)
 _WEBP = slice(8, 12)  # where a WebP file says so
 _HEAD_BYTES = 1024  # enough to recognise MPEG-TS packets, or a GIF's padding
 _NEARLY = math.tan(math.radians(1))  # FFmpeg's tolerance for quarter turns in a display matrix
@@ -98,6 +103,8 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
     times_s: list[float] = []
     count = num_hidden = 0
     with import_av().open(file, format=container) as opened:
+        if opened.format.name == _RAW_PICTURES:
+            raise FrameFileError.of(*_NO_VIDEO)
         stream = video_stream(opened)
         unit = stream.time_base
         for packet in opened.demux(stream):
@@ -134,8 +141,7 @@ def _check_kind(file: BinaryIO) -> None:
     if pointer := git_lfs_pointer(head):
         raise FrameFileError.of("a video file", pointer)
     if head.startswith(_PICTURES) or head[_WEBP] == b"WEBP":
-        got = "a picture file, or several in one (raw Motion JPEG, animated PNG)"
-        raise FrameFileError.of("a video file (make one of pictures: ffmpeg -i IN OUT.mp4)", got)
+        raise FrameFileError.of(*_NO_VIDEO)
     is_cut = head.startswith(b"GIF8") and not tail.rstrip(b"\0").endswith(b";")
     for length, offset in _TS_PACKETS:
         syncs = head[offset::length]

@@ -59,6 +59,7 @@ def evaluate(
     Example: rfm-client evaluate my_dataset --outcome outcomes.csv
     """
     from rfm_labels import DatasetError, evaluate_labels, find_label_files, read_outcomes
+    from rfm_labels.label_files import read_names
 
     output.begin()
     if not dataset.exists():
@@ -67,7 +68,8 @@ def evaluate(
     if not files:
         expected = "label files, NAME_progress.parquet (rfm-client label), or --labels"
         raise DatasetError.at(dataset, expected, "none")
-    comparison = evaluate_labels(files, None if outcome is None else read_outcomes(outcome, dataset))
+    names = {number: name for file in files for number, name in read_names(file).items()}
+    comparison = evaluate_labels(files, None if outcome is None else read_outcomes(outcome, dataset, names))
     if output.prints_tables:
         _print_tables(comparison)
         print(LEGEND.format("successes" if comparison.is_success is not None else "all episodes"))

@@ -330,7 +330,7 @@ class LabelCommand:
         with self.connect() as scorer, ProgressBar(self.say, accepts=self.options.yes) as watch:
             plan = planned(dataset, scorer, Outputs.of(dataset, self.labels), watch)
             cameras = plan.recipe.decoded_cameras
-            doubts = audit(dataset, [item.episode for item in plan.items], cameras, watch)
+            doubts = audit(dataset, plan.episodes, cameras, watch)
         tasks = sorted({task for item in plan.items for task, _ in item.episode.stretches})
         source = dataset.source + (f"@{dataset.revision}" if dataset.revision else "")
         document = {"dataset": source, "kind": dataset.kind, "episodes": len(plan.items), "frames": plan.num_frames}

@@ -19,6 +19,7 @@ from rfm_labels.datasets.episodes import Frames
 from rfm_labels.datasets.faults import require
 from rfm_labels.datasets.pictures_in_order import NUMBER, PICTURE_SUFFIXES, in_natural_order, picture_pattern
 
+_FIELDS = {"*", "{camera}", "{episode}"}
 _PART = re.compile(r"(\{\w*\}|\*)")
 _MOST_FILES = 10_000  # that a suggestion is made from
 _CAMERA = re.compile(r"(cam|color|colour|image|img|rgb|view)", re.IGNORECASE)
@@ -59,10 +60,11 @@ def _expression(pattern: str) -> re.Pattern[str]:
     """Compile a pattern. Raises DatasetError."""
     parts = _PART.split(pattern)
     fields, folders = sorted(parts[1::2]), pattern.rpartition("/")[0]
-    is_known = set(fields) <= {"*", "{camera}", "{episode}"} and fields.count("{episode}") == 1
+    is_known = set(fields) <= _FIELDS and fields.count("{episode}") == 1
     is_known = is_known and fields.count("{camera}") < 2 and not {"", "..", "."} & set(pattern.split("/"))
     expected = "{episode} once and {camera} at most once in a path below the folder: '{episode}/videos/{camera}.mp4'"
-    require("videos", is_known, expected, repr(pattern))
+    unknown = ", ".join(sorted({*fields} - _FIELDS))
+    require("videos", is_known, expected, repr(pattern) + (f", with {unknown}" if unknown else ""))
     is_numbered = Path(pattern).suffix.lower() in PICTURE_SUFFIXES
     has_number = not is_numbered or "*" in pattern.removeprefix(folders)
     require("videos", has_number, "a * for the frame's number in a picture's name, as '{episode}/*.jpg'", repr(pattern))
