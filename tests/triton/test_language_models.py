@@ -381,10 +381,26 @@ def test_the_command_line_sends_views_and_a_goal_and_only_where_they_are_read(as
         assert fault in asked.command(*words, *wrong, model="robo", fails=True)
 
 
+READER = """
+import numpy as np
+from rfm_labels import Episode
+
+def episodes(folder):
+    for file in sorted(folder.glob("*.npy")):
+        yield Episode(file.stem, {"front": np.load(file)})
+"""
+
+
+def reader(folder: Path) -> str:
+    """Return the name of a reader for the arrays in the folder."""
+    (folder / "arrays.py").write_text(READER)
+    return f"{folder / 'arrays.py'}:episodes"
+
+
 def labelled(asked: Served, folder: Path, sample: ProgressSample, model: str, *words: object) -> Any:
     """Label a folder of two equal videos, the second after the first. Return the columns of the signals."""
     folder.mkdir()
-    command = ["label", folder, "--task", sample.trajectory.task, "--name", "own", *words]
+    command = ["label", folder, "--reader", reader(folder), "--task", sample.trajectory.task, "--name", "own", *words]
     np.save(folder / "a.npy", sample.trajectory.positions)
     asked.command(*command, model=model)
     shutil.rmtree(folder / ".own_parts")  # restored from the file, with all columns
@@ -405,7 +421,7 @@ def test_labels_of_seconds_name_the_rule_that_makes_progress(asked: Served, tmp_
     frames = np.random.default_rng(1).integers(0, 256, (5, 48, 80, 3), np.uint8)
     trajectory = Trajectory(frames=frames, task=TASK)
     np.save(tmp_path / "a.npy", frames)
-    told = asked.command("label", tmp_path, "--task", TASK, model="rynn", fails=True)
+    told = asked.command("label", tmp_path, "--reader", reader(tmp_path), "--task", TASK, model="rynn", fails=True)
     assert "predicts remaining seconds and no progress, got none; give --progress-rule remaining_over_first" in told
     rule = ("--progress-rule", "remaining_over_first")
     signals = labelled(asked, tmp_path / "data", ProgressSample(trajectory), "rynn", *rule)
