@@ -320,7 +320,7 @@ class Results:
             f"{name}{', CUDA graphs' * graphs}": (run["rows"], graphs)
             for name, run in self._runs.items()
             for graphs in (False, True)
-            if any(row.get("graphs") is graphs for row in run["rows"])
+            if any(figure(aim, run["rows"], graphs) is not None for aim in aims(self._scale))
         }
         yield f"| figure | aim | {' | '.join(columns)} |"
         yield "|---" * (2 + len(columns)) + "|"
