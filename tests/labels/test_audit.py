@@ -71,7 +71,8 @@ def test_a_dry_run_writes_its_doubts_as_json(tmp_path: Path, capsys: pytest.Capt
     for file in sorted(root.rglob("data/**/*.parquet")):
         table = parquet.read_table(file)
         done = [None if file.stem.endswith("3") else True] * len(table)
-        parquet.write_table(table.append_column("next.success", pa.array(done, pa.bool_())), file)
+        table = table.append_column("next.success", pa.array(done, pa.bool_()))
+        parquet.write_table(table.append_column("success", pa.array([0.5] * len(table))), file)
     options = LabelOptions(output=tmp_path / "out", cameras=(FRONT,), frames=4)
     connect = lambda: nullcontext(BrightnessScorer())  # noqa: E731
     run = RunOptions(dry_run=True, json="-")
@@ -81,6 +82,7 @@ def test_a_dry_run_writes_its_doubts_as_json(tmp_path: Path, capsys: pytest.Capt
         "1 files that no episode uses: videos/chunk-000/observation.images.front/episode_000099.mp4; left from a recording "
         "that was written again?",
         "next.success: 1 episodes without an outcome: 3",
+        "outcome: success: episode 0: expected true, false, 1, 0, success or failure, got 0.5",
     ]
     assert (document["episodes"], document["cameras"]) == (len(open_dataset(root).episodes), [FRONT])
     assert any(note.startswith("sampling: ") for note in document["notes"])

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Advantages from progress, for advantage-conditioned and weighted imitation: the rule of RECAP.
 
-Physical Intelligence, "pi*0.6: a VLA That Learns From Experience" (arXiv 2511.14759), section IV: over N steps,
+Physical Intelligence, "pi*0.6: a VLA That Learns From Experience" (arXiv 2511.14759): over N steps,
 A(t) = r(t) + ... + r(t+N-1) + V(t+N) - V(t). Each step costs 1, and values are divided by the length of the task's
 longest episode, so that they lie between -1 and 0. Here V is progress - 1, which is 0 at the finished task.
 """

@@ -4,16 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
-from rfm_client import RewardError, UInt8Array
+from rfm_client import UInt8Array
 from rfm_client.frames import BlankFrames
 from rfm_client.options import first_names
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
-from rfm_labels.datasets.faults import listed
+from rfm_labels.datasets.faults import DatasetError, listed
 from rfm_labels.options import QUIET, Watch
 from rfm_labels.outcomes import read_outcomes
 
@@ -48,10 +47,14 @@ def audit(
         what = f"{len(unused)} files that no episode uses: {first_names(list(map(str, unused)))}"
         doubts.append(Doubt(f"{what}; left from a recording that was written again?"))
     for name in _OUTCOMES:
-        with suppress(RewardError):  # no such column
+        try:
             outcomes = read_outcomes(name, getattr(dataset, "file", dataset.root))
-            if missing := [each.index for each in episodes if outcomes.get(each.index) is None]:
-                doubts.append(Doubt(f"{name}: {len(missing)} episodes without an outcome: {listed(missing)}"))
+        except DatasetError as error:
+            if error.where != "outcome":  # else the dataset has no such column
+                doubts.append(Doubt(str(error)))
+            continue
+        if missing := [each.index for each in episodes if outcomes.get(each.index) is None]:
+            doubts.append(Doubt(f"{name}: {len(missing)} episodes without an outcome: {listed(missing)}"))
     chosen = _neighbours(len(episodes))
     watch.checking(len(chosen))
     last: dict[str, UInt8Array] = {}  # last frame by camera, of the episode before
@@ -91,7 +94,7 @@ def _of_frames(frames: Iterator[UInt8Array], camera: str, last: dict[str, UInt8A
         is_still = is_still and _difference(frame, first) <= _SAME
     last[camera] = frame
     if shown.told:
-        texts.append(f"{shown.told}")
+        texts.append(shown.told)
     elif is_still and frame is not first:
         texts.append("the picture never changes")
     return texts

@@ -162,8 +162,11 @@ class SampleScorer:
 
     async def model_infos(self, model: str, deadline: Deadline) -> list[ModelInfo]:
         """Return each server's description of ``model``, and remember the first. Raises RewardError."""
-        self._infos.pop(model, None)
-        infos = await self._servers.model_infos(model, deadline)
+        try:
+            infos = await self._servers.model_infos(model, deadline)
+        except ModelNotFoundError:
+            self._infos.pop(model, None)
+            raise
         self._infos[model] = infos[0]
         return infos
 
