@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
@@ -34,8 +33,10 @@ from rfm_client.contract.samples import (
 from rfm_client.contract.wire import DEFAULT_MODEL, PROBE_PREFIX, Part, encoder_name, frames_name
 from rfm_client.episodes.options import StepScore
 from rfm_client.episodes.scorer import Asked, StepScorer
+from rfm_client.episodes.steps import prefix_windows
 from rfm_client.frames.fit_to_checkpoint import resize_frames
 from rfm_client.frames.sampling import Sampling
+from rfm_client.scoring.batching import some_at_a_time
 from rfm_client.scoring.samples import Call, CallOptions, SampleScorer, results_of
 from rfm_client.transport.calls import Transport, TritonTransport
 from rfm_client.transport.connection import Credentials
@@ -94,7 +95,6 @@ ClientOptions.__init__.__doc__ = ClientOptions.__doc__  # so that help() on the 
 
 
 READY_POLL_S = 0.2
-PREFIXES_AT_A_TIME = 64  # how many prefixes to hold in memory
 
 
 class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
@@ -142,7 +142,12 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         return cast(SimilarityResult, await self.score(SimilaritySample(reference, other), **options))
 
     async def curve(
-        self, trajectory: Trajectory, sampling: Sampling | None = None, **options: Unpack[CallOptions]
+        self,
+        trajectory: Trajectory,
+        sampling: Sampling | None = None,
+        *,
+        go_on: Callable[[], None] | None = None,
+        **options: Unpack[CallOptions],
     ) -> ProgressResult:
         """Score every frame as if it were the newest, as ``RewardClient.curve`` does."""
         require("subsample", not options.get("subsample"), "False: the sampling rule chooses the frames", True)
@@ -154,12 +159,21 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         if options.pop("resize", False) and info.frame_size is not None:  # once, because prefixes share frames
             shrink = partial(resize_frames, size=info.frame_size)
             trajectory = await asyncio.to_thread(with_pictures, trajectory, shrink)
-        samples, results = rule.samples(trajectory), list[Result]()
-        # in a thread, because copying many frames would block the event loop
-        while part := await asyncio.to_thread(lambda: list(itertools.islice(samples, PREFIXES_AT_A_TIME))):
+
+        def begin() -> Call:
             call = self._call(options)
             call.checks_blank = False  # a prefix may repeat the first frame
-            results += results_of(await self._scorer.outcomes(part, call), "samples[{}]")
+            return call
+
+        go_on = go_on or (lambda: None)
+        if info.by_digest and not trajectory.has_views:
+            results = await self._steps.in_turn(prefix_windows(trajectory, rule), info, begin, go_on)
+            return rule.joined(cast("list[ProgressResult]", results))
+        parts, results = some_at_a_time(rule.samples(trajectory)), []
+        # in a thread, because copying many frames would block the event loop
+        while part := await asyncio.to_thread(next, parts, None):
+            go_on()
+            results += results_of(await self._scorer.outcomes(part, begin()), "samples[{}]")
         return rule.joined(cast("list[ProgressResult]", results))
 
     async def score(self, sample: Sample, **options: Unpack[CallOptions]) -> Result:

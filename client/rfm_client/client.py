@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Literal, overload
@@ -59,18 +59,26 @@ class RewardClient(ClientOptions, Closing, OneProcess):
         return self._loop.wait(self._client.preference(first, second, both_orders=both_orders, **options))
 
     def curve(
-        self, trajectory: Trajectory, sampling: Sampling | None = None, **options: Unpack[CallOptions]
+        self,
+        trajectory: Trajectory,
+        sampling: Sampling | None = None,
+        *,
+        go_on: Callable[[], None] | None = None,
+        **options: Unpack[CallOptions],
     ) -> ProgressResult:
         """Score every frame as if it were the newest: from that frame and the frames before it.
 
+        Each frame travels once if the server caches features (``ModelInfo.by_digest``).
+
         sampling: which frames the model sees from a prefix; None: as in the checkpoint's training
+        go_on: called before each underlying call, in the client's thread; may raise to end this one
         options: apply to each underlying call; several are needed because the prefixes of a long trajectory exceed
             memory
 
         Raises RewardError; ValueError if neither ``sampling`` nor the checkpoint gives a frame count, and for
         ``subsample``.
         """
-        return self._loop.wait(self._client.curve(trajectory, sampling, **options))
+        return self._loop.wait(self._client.curve(trajectory, sampling, go_on=go_on, **options))
 
     def similarity(self, reference: Trajectory, other: Trajectory, **options: Unpack[CallOptions]) -> SimilarityResult:
         """Return a raw score for how similar ``other`` is to ``reference``. Raises RewardError."""

@@ -7,7 +7,7 @@ import asyncio
 import gc
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ from rfm_client import (
     Trajectory,
     UInt8Array,
 )
-from rfm_client.episodes import Episode, StepScore
+from rfm_client.episodes import Episode, StepScore, scorer
 from rfm_client.frames import Rule, Sampling
 from shelves import V1, V2, Shelf
 from tolerances import BATCHED_VLM_TOLERANCE, TOLERANCE
@@ -41,7 +41,8 @@ def video(seed: int, count: int, size: tuple[int, int] = (40, 56)) -> UInt8Array
 
 def offline(client: RewardClient, frames: UInt8Array, sampling: Sampling = FOUR, task: str = TASK) -> ProgressResult:
     """Return the scores of all prefixes, with all pixels sent."""
-    return client.curve(Trajectory(frames=frames, task=task), sampling)
+    results = client.evaluate(list(sampling.samples(Trajectory(frames=frames, task=task))))
+    return sampling.joined(cast("list[ProgressResult]", results))
 
 
 def online(episode: Episode, frames: UInt8Array) -> tuple[list[float], list[float]]:
@@ -135,6 +136,37 @@ def test_a_step_sends_its_new_frame_alone_and_nothing_is_encoded_twice(engines: 
     pairs = {tuple(pair) for t in range(12) for pair in FOUR.prefix(t).indices.reshape(-1, 2).tolist()}
     new = {model: engines.encoded[encoder] - before[model] for model, encoder in encoders.items()}
     assert new == {MODEL: 12, IMAGES: 12, VIDEO: 2 * len(pairs)}
+
+
+@pytest.mark.parametrize("model", [MODEL, IMAGES, VIDEO])
+@pytest.mark.parametrize("forgets", [False, True])
+def test_a_curve_sends_each_frame_once_unless_the_server_forgets(
+    engines: EngineServer, monkeypatch: pytest.MonkeyPatch, model: str, forgets: bool
+) -> None:
+    frames = video(130 + forgets, 24, (56, 84))
+    monkeypatch.setattr(scorer, "HASHED_AT_A_TIME", 10)
+    monkeypatch.setattr(scorer, "MAX_BYTES_IN_TURN", 5 * frames[0].nbytes)
+    transport, trajectory = Recording(engines.url), Trajectory(frames=frames, task=TASK)
+    with RewardClient([], transports=[transport], model=model) as client:
+        scores = client.curve(trajectory, FOUR, go_on=engines.forget_features if forgets else None)
+        sent = [int(inputs["frames"].any(axis=(2, 3, 4)).sum()) for inputs in transport.requests]
+        shown = [len(np.unique(inputs["frame_digests"].reshape(-1, 32), axis=0)) for inputs in transport.requests]
+        if forgets:  # the second request was refused
+            assert sent == [shown[0], sent[1], *shown[2:]]
+        assert forgets or sum(sent) == len(frames)
+        expected = offline(client, frames)
+    assert_same((scores.progress, scores.success), expected, TOLERANCE if model == MODEL else BATCHED_VLM_TOLERANCE)
+
+
+def test_a_curve_ends_where_its_caller_says(client: RewardClient, transport: Recording) -> None:
+    def stop() -> None:
+        if len(transport.requests) == 1:
+            raise KeyError("enough")
+
+    large = Trajectory(frames=video(132, 30, (700, 700)), task=TASK)  # two requests
+    with pytest.raises(KeyError, match="enough"):
+        client.curve(large, FOUR, go_on=stop)
+    assert len(transport.requests) == 1
 
 
 class Failing(Recording):

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, cast, runtime_checkable
 
 from rfm_client import (
     FRAME_SCORES,
@@ -18,6 +18,7 @@ from rfm_client import (
     Trajectory,
     UInt8Array,
 )
+from rfm_client.frames.sampling import Sampling
 from rfm_labels.datasets.stored_files import digest_of
 
 DECISIVE = ("weights_digest", "settings_digest", "computation")  # equal if the scores are
@@ -77,6 +78,18 @@ class Scorer(Protocol):
         """Return one result per sample. Raises RewardError for the first failure."""
 
 
+@runtime_checkable
+class CurveScorer(Protocol):
+    """A scorer with this method scores prefixes by it instead of by ``evaluate``, which gets each frame many times."""
+
+    def curve(self, trajectory: Trajectory, sampling: Sampling, go_on: Callable[[], None]) -> ProgressResult:
+        """Return each frame's scores, as if it were the newest. Raises RewardError.
+
+        sampling: the frames to show then
+        go_on: to be called now and then; may raise to end the episode
+        """
+
+
 class ClientScorer:
     """A scorer that asks a client's servers. Leaves the client open."""
 
@@ -110,6 +123,10 @@ class ClientScorer:
     def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
         """Return one result per sample. Raises RewardError for the first failure."""
         return cast("list[ProgressResult]", self._client.evaluate(samples, all_scores=True))
+
+    def curve(self, trajectory: Trajectory, sampling: Sampling, go_on: Callable[[], None]) -> ProgressResult:
+        """Return each frame's scores, as if it were the newest. Raises RewardError."""
+        return self._client.curve(trajectory, sampling, go_on=go_on, all_scores=True)
 
 
 def _digests(infos: Sequence[ModelInfo]) -> tuple[str, str | None, str | None]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -36,15 +36,15 @@ from rfm_client import (
 )
 from rfm_client.frames import BlankFrames
 from rfm_client.options import InvalidValueError
+from rfm_client.scoring.batching import some_at_a_time
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.metadata import SCORES, Columns
 from rfm_labels.options import Watch
 from rfm_labels.plan import Item, Plan, Recipe
-from rfm_labels.scorer import DECISIVE, Scorer
+from rfm_labels.scorer import DECISIVE, CurveScorer, Scorer
 from rfm_labels.writing import Parts
 
 FRAMES_AT_A_TIME = 64  # per encoder request, as in the encoder's forward pass
-MAX_BYTES = 32 * 2**20  # for the samples in one scorer call
 MAX_FRAME_BYTES = 2 * 2**30  # for all workers in the process
 
 _NOT_ABOUT_ONE_EPISODE = (ServerUnavailableError, DeadlineExceededError, ModelNotFoundError, AccessDeniedError)
@@ -200,13 +200,13 @@ def episode_scores(
         for number, (task, count) in enumerate(episode.stretches, 1):
             is_last = number == len(episode.stretches)  # reads on, to detect surplus frames
             stretch = together if is_last else [itertools.islice(frames, count) for frames in together]
-            chunks = [_shrunk(frames, recipe, go_on) for frames in stretch]
+            sized = [_resized(frames, recipe, go_on) for frames in stretch]
             if recipe.checkpoint.encodes:
-                result = _scores(_joined([scorer.encode(chunk, task) for chunk in chunks[0]]), scorer, recipe, go_on)
+                result = _scores(_encoded(sized[0], task, scorer), scorer, recipe, go_on)
             else:
-                firsts = [next(each) for each in chunks]
-                with memory.holding(sum(first[0].nbytes for first in firsts) * count):
-                    result = _scores(_held(firsts, chunks, task, count, recipe), scorer, recipe, go_on)
+                firsts = [next(each) for each in sized]
+                with memory.holding(sum(first.nbytes for first in firsts) * count):
+                    result = _scores(_held(firsts, sized, task, count, recipe), scorer, recipe, go_on)
             by_camera.setdefault(camera, []).append(result)
     highest = {camera: frames.highest for camera, frames in shown.items()}
     blank = {camera: value for camera, value in highest.items() if value is not None}
@@ -234,9 +234,11 @@ def _columns(by_camera: Mapping[str, Sequence[ProgressResult]], episode: Dataset
 def _scores(trajectory: Trajectory, scorer: Scorer, recipe: Recipe, go_on: Callable[[], None]) -> ProgressResult:
     if recipe.in_one_pass(trajectory.num_frames):
         (result,) = scorer.evaluate([ProgressSample(trajectory)])
+    elif isinstance(scorer, CurveScorer):
+        result = scorer.curve(trajectory, recipe.sampling, go_on)
     else:
         results: list[ProgressResult] = []
-        for together in _by_bytes(recipe.sampling.samples(trajectory)):
+        for together in some_at_a_time(recipe.sampling.samples(trajectory)):
             go_on()
             results += scorer.evaluate(together)
         result = recipe.sampling.joined(results)
@@ -248,14 +250,18 @@ def _scores(trajectory: Trajectory, scorer: Scorer, recipe: Recipe, go_on: Calla
         raise InvalidSampleError(error.problem, error.where) from error
 
 
-def _shrunk(frames: Iterator[UInt8Array], recipe: Recipe, go_on: Callable[[], None]) -> Iterator[UInt8Array]:
-    """Yield arrays with at most FRAMES_AT_A_TIME frames, resized if the recipe says so."""
-    while chunk := list(itertools.islice(frames, FRAMES_AT_A_TIME)):
+def _resized(frames: Iterator[UInt8Array], recipe: Recipe, go_on: Callable[[], None]) -> Iterator[UInt8Array]:
+    """Yield the frames, uint8 [H, W, 3], resized if the recipe says so."""
+    for frame in frames:
         go_on()
-        yield recipe.resized(np.stack(chunk))
+        yield recipe.resized(frame[np.newaxis])[0]
 
 
-def _joined(parts: Sequence[Trajectory]) -> Trajectory:
+def _encoded(frames: Iterator[UInt8Array], task: str, scorer: Scorer) -> Trajectory:
+    """Return the frames' embeddings, from requests with at most FRAMES_AT_A_TIME frames."""
+    parts: list[Trajectory] = []
+    while chunk := list(itertools.islice(frames, FRAMES_AT_A_TIME)):
+        parts.append(scorer.encode(np.stack(chunk), task))
     embeddings = np.concatenate([part.positions for part in parts])
     return Trajectory(video_embeddings=embeddings, text_embedding=parts[0].text_embedding)
 
@@ -263,33 +269,17 @@ def _joined(parts: Sequence[Trajectory]) -> Trajectory:
 def _held(
     firsts: Sequence[UInt8Array], others: Sequence[Iterator[UInt8Array]], task: str, count: int, recipe: Recipe
 ) -> Trajectory:
-    """Return a trajectory for camera and views, given each one's first chunk and an iterator over the rest."""
-    frames, *views = (_filled(first, chunks, count) for first, chunks in zip(firsts, others, strict=True))
+    """Return a trajectory for camera and views, given each one's first frame and an iterator over the rest."""
+    frames, *views = (_filled(first, rest, count) for first, rest in zip(firsts, others, strict=True))
     goal = None if recipe.goal is None else recipe.resized(recipe.goal.picture(frames)[np.newaxis])[0]
     return Trajectory(frames=frames, task=task, views=tuple(views), goal=goal)
 
 
 def _filled(first: UInt8Array, others: Iterator[UInt8Array], count: int) -> UInt8Array:
-    frames = np.empty((count, *first.shape[1:]), np.uint8)
-    start = 0
-    for chunk in itertools.chain([first], others):
-        frames[start : start + len(chunk)] = chunk
-        start += len(chunk)
+    frames = np.empty((count, *first.shape), np.uint8)
+    for index, frame in enumerate(itertools.chain([first], others)):
+        frames[index] = frame
     return frames
-
-
-def _by_bytes(samples: Iterable[ProgressSample]) -> Iterator[list[ProgressSample]]:
-    """Group samples into lists that hold at most MAX_BYTES or a single sample."""
-    together: list[ProgressSample] = []
-    num_bytes = 0
-    for sample in samples:
-        if together and num_bytes + sample.trajectory.positions.nbytes > MAX_BYTES:
-            yield together
-            together, num_bytes = [], 0
-        together.append(sample)
-        num_bytes += sample.trajectory.positions.nbytes
-    if together:
-        yield together
 
 
 def _noted(frames: Iterator[UInt8Array], shown: BlankFrames) -> Iterator[UInt8Array]:

@@ -2,7 +2,7 @@
 """Score steps through progress requests that send only the frames that the server lacks.
 
 A server may lack more frames than expected: it restarted, dropped frames, or is another server. It then refuses, and
-all pixels are sent. Either way, the answer equals that for a ``ProgressSample`` with the same frames.
+gets every frame. Either way, the answer equals that for a ``ProgressSample`` with the same frames.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from __future__ import annotations
 import asyncio
 import random
 from collections import Counter, OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from itertools import groupby, islice
+from itertools import groupby, islice, zip_longest
 from typing import TypeAlias
 from weakref import WeakKeyDictionary
 
@@ -25,10 +25,12 @@ from rfm_client.contract.wire import frames_name
 from rfm_client.episodes.options import StepScore
 from rfm_client.episodes.steps import Steps, Window
 from rfm_client.frames.blank_frames import FRAMES_IN_A_ROW
-from rfm_client.scoring.samples import Call, SampleScorer, for_each
+from rfm_client.scoring.samples import Call, SampleScorer, for_each, results_of
 from rfm_client.transport.threads import off_loop
 
 MAX_NEW_BYTES = 3 * 2**20  # frame bytes per request: the server prepares a request while the next is sent
+MAX_BYTES_IN_TURN = 32 * 2**20  # the same where a request waits for the one before: one batch for a server
+HASHED_AT_A_TIME = 64  # windows
 MAX_REMEMBERED = 2**17  # digests of sent frames; the oldest are forgotten
 
 
@@ -36,10 +38,14 @@ Asked: TypeAlias = tuple[Steps, int]  # an episode, and the step to score
 
 
 class _Server:
-    """Frame digests that one server has received. number: the server's index."""
+    """Frame digests that one server has received.
+
+    number: the server's index
+    num_refusals: how often the server lacked frames that it had received
+    """
 
     def __init__(self, number: int) -> None:
-        self.number = number
+        self.number, self.num_refusals = number, 0
         self._sent: OrderedDict[bytes, None] = OrderedDict()
 
     def __contains__(self, digest: bytes) -> bool:
@@ -84,6 +90,39 @@ class StepScorer:
             for (steps, step), (prefix, windows) in zip(asked, shown, strict=True)
         ]
 
+    async def in_turn(
+        self, windows: Sequence[Window], info: ModelInfo, begin: Callable[[], Call], go_on: Callable[[], None]
+    ) -> list[Result]:
+        """Return results for one episode's windows. A request waits for the one before, so each frame travels once.
+
+        If the server keeps too few frames, the later requests send all that they show, once each.
+
+        begin: returns the call for a request
+        go_on: called before each request; may raise to end the episode
+
+        Raises RewardError.
+        """
+        self._scorer.tell_of_length(max(len(window.frames) for window in windows), info)
+        results: list[Result] = []
+        server, call = self._server(windows[0]), begin()
+        outputs = (*wire.outputs_for((), info.scores, all_scores=call.all_scores), *call.outputs)
+        num_refusals = server.num_refusals
+        parts = [windows[start : start + HASHED_AT_A_TIME] for start in range(0, len(windows), HASHED_AT_A_TIME)]
+        hashed = asyncio.create_task(_hashed(parts[0]))
+        try:
+            for part, following in zip_longest(parts, parts[1:], fillvalue=()):
+                await hashed
+                hashed = asyncio.create_task(_hashed(following))  # while the server scores
+                for indices in self._parts(part, info.max_batch_size, MAX_BYTES_IN_TURN):
+                    go_on()
+                    outcomes = await self._outcomes([part[index] for index in indices], outputs, begin())
+                    results += results_of(list(outcomes), "samples[{}]")
+                    if server.num_refusals > num_refusals:
+                        server.forget(frame.digest for window in part for frame in window.frames)
+        finally:
+            hashed.cancel()
+        return results
+
     async def _all_outcomes(self, windows: Sequence[Window], info: ModelInfo, call: Call) -> list[Result | RewardError]:
         self._scorer.tell_of_length(max((len(window.frames) for window in windows), default=0), info)
         enough = min(info.max_frames or FRAMES_IN_A_ROW, FRAMES_IN_A_ROW)  # a camera may begin with a black frame
@@ -92,10 +131,9 @@ class StepScorer:
                 self._scorer.tell_of_blank([frame.pixels for frame in frames])
         if not info.by_digest:
             return await self._whole(windows, call)
-        num_new = sum(w.num_bytes // len(w.frames) for w in windows)  # about one frame in each window is new
-        await off_loop(num_new, lambda: [frame.digest for window in windows for frame in window.frames])
+        await _hashed(windows)
         outcomes: dict[int, Result | RewardError] = {}
-        parts = list(self._parts(windows, info.max_batch_size))
+        parts = list(self._parts(windows, info.max_batch_size, MAX_NEW_BYTES))
         outputs = wire.outputs_for((), info.scores)
         asked = (self._outcomes([windows[index] for index in part], outputs, call) for part in parts)
         answered = await asyncio.gather(*asked)
@@ -103,10 +141,10 @@ class StepScorer:
             outcomes.update(zip(part, of_part, strict=True))
         return [outcomes[index] for index in range(len(windows))]
 
-    def _parts(self, windows: Sequence[Window], limit: int) -> Iterator[list[int]]:
+    def _parts(self, windows: Sequence[Window], limit: int, max_bytes: int) -> Iterator[list[int]]:
         """Yield window indices for each request.
 
-        A request has frames of one size, for one server, at most ``limit`` windows, and at most MAX_NEW_BYTES unless a
+        A request has frames of one size, for one server, at most ``limit`` windows, and at most ``max_bytes`` unless a
         single window has more.
         """
         servers = [self._server(window) for window in windows]
@@ -121,7 +159,7 @@ class StepScorer:
                 frames = windows[index].frames
                 own = {frame.digest for frame in frames if frame.digest not in servers[index]}
                 num_bytes = _padded_bytes(len(part) + 1, len(sent | own), frames[0].pixels.nbytes)
-                if part and (len(part) == limit or num_bytes > MAX_NEW_BYTES):
+                if part and (len(part) == limit or num_bytes > max_bytes):
                     yield part
                     part, sent = [], set()
                 part.append(index)
@@ -131,24 +169,24 @@ class StepScorer:
     async def _outcomes(
         self, windows: Sequence[Window], outputs: Sequence[str], call: Call
     ) -> Sequence[Result | RewardError]:
-        """Send a request; if it fails, perhaps because the server lacks frames, send all pixels."""
+        """Send a request. If it fails, perhaps because the server lacks frames, send all frames, then whole samples."""
         server = self._server(windows[0])
         call = call.at(server.number)
-        new = {frame.digest: frame.pixels for window in windows for frame in window.frames}
-        digests = list(new)
-        sent = [pixels for digest, pixels in new.items() if digest not in server]
-        try:
-            results = await self._request(windows, sent, outputs, call)
-        except (InvalidSampleError, InferenceFailedError):  # the server may lack frames
-            server.forget(digests)
-            outcomes = await self._whole(windows, call)
-            if not any(isinstance(outcome, RewardError) for outcome in outcomes):
-                server.remember(digests)
-            return outcomes
-        except RewardError as error:
-            return for_each(error, len(windows))
-        server.remember(digests)
-        return results
+        shown = {frame.digest: frame.pixels for window in windows for frame in window.frames}
+        while True:
+            sent = [pixels for digest, pixels in shown.items() if digest not in server]
+            try:
+                results = await self._request(windows, sent, outputs, call)
+            except (InvalidSampleError, InferenceFailedError):
+                server.forget(shown)
+                if len(sent) < len(shown):
+                    server.num_refusals += 1
+                    continue
+                return await self._whole(windows, call)
+            except RewardError as error:
+                return for_each(error, len(windows))
+            server.remember(shown)
+            return results
 
     def _server(self, window: Window) -> _Server:
         """Return the server for a window's episode; a new episode gets one with the fewest episodes."""
@@ -176,6 +214,12 @@ class StepScorer:
     async def _whole(self, windows: Sequence[Window], call: Call) -> list[Result | RewardError]:
         samples = await off_loop(sum(w.num_bytes for w in windows), lambda: [window.sample for window in windows])
         return await self._scorer.outcomes(samples, call)
+
+
+async def _hashed(windows: Sequence[Window]) -> None:
+    """Compute the digests of the frames in these windows."""
+    num_new = sum(w.num_bytes // len(w.frames) for w in windows)  # about one frame in each window is new
+    await off_loop(num_new, lambda: [frame.digest for window in windows for frame in window.frames])
 
 
 def _padded_bytes(num_windows: int, num_frames: int, frame_bytes: int) -> int:
