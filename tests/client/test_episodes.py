@@ -144,8 +144,7 @@ def test_a_curve_sends_each_frame_once_unless_the_server_forgets(
     engines: EngineServer, monkeypatch: pytest.MonkeyPatch, model: str, forgets: bool
 ) -> None:
     frames = video(130 + forgets, 24, (56, 84))
-    monkeypatch.setattr(scorer, "HASHED_AT_A_TIME", 10)
-    monkeypatch.setattr(scorer, "MAX_BYTES_IN_TURN", 5 * frames[0].nbytes)
+    monkeypatch.setattr(scorer, "MAX_NEW_BYTES_IN_TURN", 5 * frames[0].nbytes)
     transport, trajectory = Recording(engines.url), Trajectory(frames=frames, task=TASK)
     with RewardClient([], transports=[transport], model=model) as client:
         scores = client.curve(trajectory, FOUR, go_on=engines.forget_features if forgets else None)
@@ -163,7 +162,7 @@ def test_a_curve_ends_where_its_caller_says(client: RewardClient, transport: Rec
         if len(transport.requests) == 1:
             raise KeyError("enough")
 
-    large = Trajectory(frames=video(132, 30, (700, 700)), task=TASK)  # two requests
+    large = Trajectory(frames=video(132, 4, (700, 700)), task=TASK)  # two requests
     with pytest.raises(KeyError, match="enough"):
         client.curve(large, FOUR, go_on=stop)
     assert len(transport.requests) == 1

@@ -29,8 +29,7 @@ from rfm_client.scoring.samples import Call, SampleScorer, for_each, results_of
 from rfm_client.transport.threads import off_loop
 
 MAX_NEW_BYTES = 3 * 2**20  # frame bytes per request: the server prepares a request while the next is sent
-MAX_BYTES_IN_TURN = 32 * 2**20  # the same where a request waits for the one before: one batch for a server
-HASHED_AT_A_TIME = 64  # windows
+MAX_NEW_BYTES_IN_TURN = 4 * 2**20  # the same for one episode, where a request waits for the answer to the last
 MAX_REMEMBERED = 2**17  # digests of sent frames; the oldest are forgotten
 
 
@@ -103,22 +102,22 @@ class StepScorer:
         Raises RewardError.
         """
         self._scorer.tell_of_length(max(len(window.frames) for window in windows), info)
-        results: list[Result] = []
-        server, call = self._server(windows[0]), begin()
+        call, results = begin(), list[Result]()
         outputs = (*wire.outputs_for((), info.scores, all_scores=call.all_scores), *call.outputs)
+        server = self._server(windows[0])
         num_refusals = server.num_refusals
-        parts = [windows[start : start + HASHED_AT_A_TIME] for start in range(0, len(windows), HASHED_AT_A_TIME)]
+        count = min(max(MAX_NEW_BYTES_IN_TURN // windows[0].frames[0].pixels.nbytes, 1), info.max_batch_size)
+        parts = [windows[start : start + count] for start in range(0, len(windows), count)]
         hashed = asyncio.create_task(_hashed(parts[0]))
         try:
             for part, following in zip_longest(parts, parts[1:], fillvalue=()):
                 await hashed
                 hashed = asyncio.create_task(_hashed(following))  # while the server scores
-                for indices in self._parts(part, info.max_batch_size, MAX_BYTES_IN_TURN):
-                    go_on()
-                    outcomes = await self._outcomes([part[index] for index in indices], outputs, begin())
-                    results += results_of(list(outcomes), "samples[{}]")
-                    if server.num_refusals > num_refusals:
-                        server.forget(frame.digest for window in part for frame in window.frames)
+                go_on()
+                results += results_of(list(await self._outcomes(part, outputs, begin())), "samples[{}]")
+                if server.num_refusals > num_refusals:
+                    shown = windows[: len(results)]
+                    server.forget(frame.digest for window in shown for frame in window.frames)
         finally:
             hashed.cancel()
         return results
@@ -133,7 +132,7 @@ class StepScorer:
             return await self._whole(windows, call)
         await _hashed(windows)
         outcomes: dict[int, Result | RewardError] = {}
-        parts = list(self._parts(windows, info.max_batch_size, MAX_NEW_BYTES))
+        parts = list(self._parts(windows, info.max_batch_size))
         outputs = wire.outputs_for((), info.scores)
         asked = (self._outcomes([windows[index] for index in part], outputs, call) for part in parts)
         answered = await asyncio.gather(*asked)
@@ -141,10 +140,10 @@ class StepScorer:
             outcomes.update(zip(part, of_part, strict=True))
         return [outcomes[index] for index in range(len(windows))]
 
-    def _parts(self, windows: Sequence[Window], limit: int, max_bytes: int) -> Iterator[list[int]]:
+    def _parts(self, windows: Sequence[Window], limit: int) -> Iterator[list[int]]:
         """Yield window indices for each request.
 
-        A request has frames of one size, for one server, at most ``limit`` windows, and at most ``max_bytes`` unless a
+        A request has frames of one size, for one server, at most ``limit`` windows, and at most MAX_NEW_BYTES unless a
         single window has more.
         """
         servers = [self._server(window) for window in windows]
@@ -159,7 +158,7 @@ class StepScorer:
                 frames = windows[index].frames
                 own = {frame.digest for frame in frames if frame.digest not in servers[index]}
                 num_bytes = _padded_bytes(len(part) + 1, len(sent | own), frames[0].pixels.nbytes)
-                if part and (len(part) == limit or num_bytes > max_bytes):
+                if part and (len(part) == limit or num_bytes > MAX_NEW_BYTES):
                     yield part
                     part, sent = [], set()
                 part.append(index)
