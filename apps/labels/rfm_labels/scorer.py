@@ -66,7 +66,7 @@ class CheckpointFacts:
 
 
 class Scorer(Protocol):
-    """Scores samples with one checkpoint. Must be thread-safe."""
+    """Scores samples with one checkpoint. Must be thread-safe. May be a ``CurveScorer``, too."""
 
     def checkpoint(self) -> CheckpointFacts:
         """Return facts about the checkpoint that answers now. Raises RewardError."""
