@@ -121,7 +121,8 @@ def rows(folder: Path, scale: Scale) -> Iterator[dict[str, Any]]:
         for graphs in (False, True) if knows_graphs and kind == ROBOMETER else (False,):
             known: dict[str, dict[str, Any]] = {ROBOMETER: {"base_model": str(BASE_MODEL)}, RYNNVALUE: DESCRIBED}
             sources = known.get(kind, {"reward_model": what})
-            options: dict[str, Any] = {"cuda_graphs": True} if graphs else {}
+            options: dict[str, Any] = {"feature_cache_mib": ExportConfig().feature_cache_mib}  # as the server's
+            options |= {"cuda_graphs": True} if graphs else {}
             checkpoint = published.load(folder / kind, **sources)
             engine = Engine.of(checkpoint, device=scale.device, max_sample_tokens=MAX_TOKENS, **options)
             for size in sizes[:2] if graphs else sizes:
