@@ -38,7 +38,7 @@ class Doubt:
 def audit(
     dataset: Dataset, episodes: Sequence[DatasetEpisode], cameras: Sequence[str], watch: Watch = QUIET
 ) -> list[Doubt]:
-    """Return doubts about files and outcomes, and about the frames of at most MOST_DECODED episodes.
+    """Return doubts about files, their numbers and outcomes, and about the frames of at most MOST_DECODED episodes.
 
     Raises RewardError if a frame cannot be decoded.
     """
@@ -55,6 +55,10 @@ def audit(
             continue
         if missing := [each.index for each in episodes if outcomes.get(each.index) is None]:
             doubts.append(Doubt(f"{name}: {len(missing)} episodes without an outcome: {listed(missing)}"))
+    for episode in episodes:
+        for camera in cameras:
+            if text := dataset.doubt(episode, camera):
+                doubts.append(Doubt(text, episode.index, camera))
     chosen = _neighbours(len(episodes))
     watch.checking(len(chosen))
     last: dict[str, UInt8Array] = {}  # last frame by camera, of the episode before

@@ -293,6 +293,10 @@ class Dataset(ABC):
         """Return files with rows or frames that no episode uses, relative to ``root``; empty for most layouts."""
         return []
 
+    def doubt(self, episode: DatasetEpisode, camera: str) -> str:
+        """Return what the episode's files say of frames that may be missing, without decoding; empty for nothing."""
+        return ""
+
     @abstractmethod
     def decoder(self, camera: str) -> str | None:
         """Return the library that decodes the camera's frames, with its version; None: they are stored as pixels."""

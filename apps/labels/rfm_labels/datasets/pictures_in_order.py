@@ -61,6 +61,21 @@ def in_order_of_numbers(folder: Path, files: Sequence[str]) -> list[str]:
     return [name.file for name in names]
 
 
+def missing_numbers(files: Sequence[str]) -> str:
+    """Say where pictures, in order, skip numbers; empty: nowhere, or their numbers have no usual step."""
+    names = [_Name.of(file) for file in files]
+    counts = [column for column in zip(*(name.numbers for name in names), strict=False) if len(set(column)) > 1]
+    if len(counts) != 1 or len({name.words for name in names}) > 1:
+        return ""
+    steps = [after - before for before, after in itertools.pairwise(counts[0])]
+    usual, how_often = Counter(sorted(steps)).most_common(1)[0]
+    gaps = [pair for pair, step in zip(itertools.pairwise(files), steps, strict=True) if step > usual]
+    if not gaps or usual <= 0 or 2 * how_often < len(steps):
+        return ""
+    more = f", and {len(gaps) - 1} more such gaps" if len(gaps) > 1 else ""
+    return f"no picture between {' and '.join(gaps[0])}{more}; were frames dropped while recording?"
+
+
 def _counts_cameras(names: Sequence[_Name], place: int) -> bool:
     """True if the numbers at a place count cameras, and not frames.
 
