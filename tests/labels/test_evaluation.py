@@ -247,7 +247,7 @@ def test_no_number_is_cut_on_a_terminal_and_episodes_without_an_outcome_are_left
         told = " ".join(line for line in shown.splitlines() if line.lstrip().startswith(name)).split()
         assert found.final_of_successes is not None and found.by_success is not None
         numbers = [found.final, found.final_of_successes, found.by_success.threshold]
-        assert {*(f"{number:.3f}" for number in numbers), f"{found.backwards:.1%}"} <= {*told}
+        assert {*(f"{number:.4f}" for number in numbers), f"{found.backwards:.1%}"} <= {*told}
 
 
 @pytest.mark.slow

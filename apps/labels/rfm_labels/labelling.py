@@ -107,7 +107,7 @@ def put_together(
     if len(plan.items) < num_episodes:
         others = "; LeRobot's reader gives frames of the others the weight 1.0" if outputs.progress else ""
         watch.note(f"{len(plan.items)} of the dataset's {num_episodes} episodes have labels{others}")
-    return replace(report, files=files, summary=summary_of(labels))
+    return replace(report, files=files, summary=summary_of(labels, plan.names))
 
 
 @dataclass(frozen=True)

@@ -245,6 +245,11 @@ class Plan:
         """The episodes to label."""
         return [item.episode for item in self.items]
 
+    @property
+    def names(self) -> dict[int, str]:
+        """The names of the episodes that have names of their own, by number."""
+        return {each.index: name for each in self.episodes if (name := each.own_name)}
+
     def digests(self) -> dict[str, str]:
         """Return item digests by episode number."""
         return {str(item.episode.index): item.digest for item in self.items}

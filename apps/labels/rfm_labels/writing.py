@@ -374,7 +374,7 @@ def write_labels(labels: Any, plan: Plan, progress: Sequence[Path], signals: Seq
     forms = [(path, _progress_form(plan, columns)) for path in progress]
     forms += [(path, _signals_form(plan, columns, name)) for path in signals]
     shared = {EPISODES_KEY: canonical_json(plan.digests()), **(labels.schema.metadata or {})}
-    if names := {str(each.index): each.name for each in plan.episodes if each.name != f"episode {each.index}"}:
+    if names := plan.names:
         shared[NAMES_KEY] = canonical_json(names)
     labels = _with_totals(labels, plan)
     for path, _ in forms:

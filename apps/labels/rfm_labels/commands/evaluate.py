@@ -87,14 +87,14 @@ def _print_tables(comparison: LabelComparison) -> None:
     if known is not None:
         columns[5:5] = ["of successes", "of failures", "AUROC success", "AUROC progress", "threshold", "accuracy"]
     for each in comparison.evaluations:
-        cells = [each.name, number(each.spearman, 3), number(each.kendall, 3), str(each.num_constant)]
-        cells.append(number(each.final, 3))
+        cells = [each.name, number(each.spearman), number(each.kendall), str(each.num_constant)]
+        cells.append(number(each.final))
         if known is not None:
             success, progress = each.by_success, each.by_progress
-            cells += [number(each.final_of_successes, 3), number(each.final_of_failures, 3)]
-            cells += [number(ranking.auroc if ranking else None, 3) for ranking in (success, progress)]
-            cells.append(number(success.threshold if success else None, 3))
-            cells.append(number(success.balanced_accuracy if success else None, 3))
+            cells += [number(each.final_of_successes), number(each.final_of_failures)]
+            cells += [number(ranking.auroc if ranking else None) for ranking in (success, progress)]
+            cells.append(number(success.threshold if success else None))
+            cells.append(number(success.balanced_accuracy if success else None))
         rows.append([*cells, f"{each.backwards:.1%}"])
     counts = f"{len(comparison.episodes)} episodes"
     if known is not None:

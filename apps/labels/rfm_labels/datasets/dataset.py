@@ -129,6 +129,11 @@ class DatasetEpisode:
     tasks: tuple[tuple[int, str], ...] = ()
 
     @property
+    def own_name(self) -> str | None:
+        """The name; None: it only repeats the number, as in LeRobot."""
+        return None if self.name == f"episode {self.index}" else self.name
+
+    @property
     def stretches(self) -> list[tuple[str, int]]:
         """Task and frame count for each stretch with one task, in order."""
         tasks = self.tasks or ((0, self.task),)
