@@ -10,7 +10,7 @@ import numpy as np
 
 from rfm_client import UInt8Array
 from rfm_client.frames import BlankFrames
-from rfm_client.options import first_names
+from rfm_client.options import counted, first_names
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.datasets.faults import DatasetError, listed, named
 from rfm_labels.options import QUIET, Watch
@@ -54,7 +54,7 @@ def audit(
     """
     doubts = []
     if unused := dataset.unused_files():
-        what = f"{len(unused)} files that no episode uses: {first_names(list(map(str, unused)))}"
+        what = f"{counted(len(unused), 'file')} that no episode uses: {first_names(list(map(str, unused)))}"
         doubts.append(Doubt(f"{what}; left from a recording that was written again?"))
     for name in _OUTCOMES:
         try:
@@ -64,7 +64,7 @@ def audit(
                 doubts.append(Doubt(str(error)))
             continue
         if missing := [each.index for each in episodes if outcomes.get(each.index) is None]:
-            doubts.append(Doubt(f"{name}: {len(missing)} episodes without an outcome: {listed(missing)}"))
+            doubts.append(Doubt(f"{name}: {counted(len(missing), 'episode')} without an outcome: {listed(missing)}"))
     for episode in episodes:
         for camera in cameras:
             if text := dataset.doubt(episode, camera):

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from rfm_client.options import counted
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset
 from rfm_labels.datasets.faults import DatasetError
 from rfm_labels.label_files import LabelFile
@@ -79,7 +80,7 @@ def planned(dataset: Dataset, scorer: Scorer, outputs: Outputs, watch: Watch = Q
                 option = "--alias" if file.path in outputs.progress[1:] else "--name"
                 problem = f"{error.problem}: choose another {option}, or --overwrite"
                 raise DatasetError(problem, error.where) from error
-            labels = f"its labels of {len(file.digests)} episodes are" if file.digests else "it is"
+            labels = f"its labels of {counted(len(file.digests), 'episode')} are" if file.digests else "it is"
             watch.note(f"--overwrite: {error}; {labels} replaced")
     checked_episodes(dataset, options, watch)  # after the cheap refusals
     return plan

@@ -13,9 +13,9 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias, get_args
 import typer
 
 from rfm_client import RewardError
-from rfm_client.command_line import ExitCode, JsonOutput, ServerOptions, print_table, report, with_options
+from rfm_client.command_line import ExitCode, JsonOutput, ServerOptions, print_facts, report, with_options
 from rfm_client.frames import ChannelOrder, Orientation
-from rfm_client.options import ConfigError, Settings, setting
+from rfm_client.options import ConfigError, Settings, counted, setting
 from rfm_labels.audit import audit
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, SeveralTasks, parsed_by_camera
 from rfm_labels.datasets.faults import FaultsError, UnusedTaskError, listed, require
@@ -88,7 +88,7 @@ class ProgressBar(Watch):
 
     def downloading(self, num_files: int, num_bytes: int) -> None:
         """Write how much is downloaded. Raises ConfigError, or typer.Abort after a "no", for a large download."""
-        size = f"{num_bytes / 1e9:.2f} GB in {num_files} files"
+        size = f"{num_bytes / 1e9:.2f} GB in {counted(num_files, 'file')}"
         self.note(f"downloading {size}, all that the chosen episodes and cameras need")
         if num_bytes <= ASK_BYTES or self._accepts:
             return
@@ -338,7 +338,7 @@ class LabelCommand:
         self.options.write_json(document | {"doubts": [asdict(doubt) for doubt in doubts]})
         if not self.options.prints_tables:
             return
-        decoded = f"of {len(cameras)} cameras: {plan.num_frames * len(cameras)} to be decoded"
+        decoded = f"of {counted(len(cameras), 'camera')}: {plan.num_frames * len(cameras)} to be decoded"
         rows = [
             ("dataset", f"{dataset.kind}: {source}"),
             ("episodes", str(len(plan.items))),
@@ -346,13 +346,13 @@ class LabelCommand:
             (f"tasks: {len(tasks)}", "; ".join(tasks[:5]) + (" ..." if len(tasks) > 5 else "")),
             ("doubts", "none" if not doubts else str(len(doubts))),
         ]
-        _print(rows)
+        print_facts(rows)
         for doubt in doubts:
             typer.echo(f"doubt: {doubt}")
 
     def _tell(self, report: Report) -> ExitCode:
         if report.failures:
-            failed = f"{len(report.failures)} episodes failed"
+            failed = f"{counted(len(report.failures), 'episode')} failed"
             self.say(f"{failed}, so no file was written; the others are kept in {report.parts}")
             gone = {failure.episode.index for failure in report.failures}
             others = [item.episode.index for item in report.plan.items if item.episode.index not in gone]
@@ -362,7 +362,7 @@ class LabelCommand:
         if report.summary is None:
             self.say(f"this shard is labelled; the same command without --shard writes the files from {report.parts}")
             return ExitCode.OK
-        _print(report.summary.rows())
+        print_facts(report.summary.rows())
         for file in report.files:
             typer.echo(f"{file}")
         return ExitCode.OK
@@ -378,12 +378,7 @@ class LabelCommand:
         summary = summarise(path)
         for line in blank_lines(read_blank(path), len(summary.episodes)):
             self.say(f"note: {line}")
-        _print(summary.rows())
+        print_facts(summary.rows())
 
     def _dataset(self) -> Dataset:
         return open_dataset(self.source, **self.texts.opening)
-
-
-def _print(rows: Sequence[tuple[str, str]]) -> None:
-    print_table("", ("labels", ""), rows)
-    sys.stdout.flush()

@@ -35,7 +35,7 @@ class Stored(ABC):
         return None
 
     def doubt(self) -> str:
-        """As ``Dataset.doubt``."""
+        """Return the same as ``Dataset.doubt`` for these frames."""
         return ""
 
     def check(self) -> None:  # noqa: B027 - ``count`` checks most kinds
