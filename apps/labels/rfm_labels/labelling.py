@@ -21,7 +21,7 @@ from rfm_labels.datasets.faults import DatasetError
 from rfm_labels.label_files import LabelFile
 from rfm_labels.metadata import PROGRESS, SCORES, blank_from_metadata, blank_lines, skipping_in
 from rfm_labels.options import DEFAULTS, QUIET, LabelOptions, Watch
-from rfm_labels.plan import Plan, checked_episodes, plan_labels
+from rfm_labels.plan import Plan, checked_episodes, part_key, plan_labels
 from rfm_labels.scorer import Scorer
 from rfm_labels.scoring import FailedEpisode, Run
 from rfm_labels.summary import Summary, summary_of
@@ -143,7 +143,17 @@ class Outputs:
     @cached_property
     def parts(self) -> Parts:
         """The finished episodes. First access creates their folder."""
-        return Parts(self.options.parts or str(self.folder / f".{self.options.name}_parts"))
+        return Parts(self.options.parts or str(self.own_parts))
+
+    @property
+    def own_parts(self) -> Path:
+        """The folder of the parts, unless another place is named."""
+        return self.folder / f".{self.options.name}_parts"
+
+    def keeps(self, file: LabelFile) -> bool:
+        """True if the parts have all labels of a file, so that the same run writes it again without scoring."""
+        keys = self.parts.keys() if self.options.parts or self.own_parts.is_dir() else set()
+        return bool(file.digests) and {part_key(*each) for each in file.digests.items()} <= keys
 
     def make_folder(self) -> None:
         """Create the folder if it is missing. Raises DatasetError if it is not writable."""

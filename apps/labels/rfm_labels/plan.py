@@ -209,6 +209,11 @@ class Recipe:
         require(longest.name, len(fit) == len(episodes), f"at most {limit} frames, as the checkpoint takes", got)
 
 
+def part_key(number: int, digest: str) -> str:
+    """Return the name of an episode's part, without suffix."""
+    return f"episode-{number:06d}-{digest}"
+
+
 @dataclass(frozen=True)
 class Item:
     """One episode to label. digest: over everything that decides its labels."""
@@ -219,7 +224,7 @@ class Item:
     @property
     def key(self) -> str:
         """The part's name, without suffix."""
-        return f"episode-{self.episode.index:06d}-{self.digest}"
+        return part_key(self.episode.index, self.digest)
 
 
 @dataclass(frozen=True)
