@@ -204,7 +204,8 @@ class LabelFile:
     def checkpoint(self) -> str:
         """Where the checkpoint comes from, else its digest; empty: unknown."""
         checkpoint = self.provenance.get("checkpoint") or {}
-        return str(checkpoint.get("source") or checkpoint.get("weights_digest") or "")
+        source = checkpoint.get("source") or checkpoint.get("weights_digest") or ""
+        return str(source).removesuffix("/checkpoint")  # the folder of a run has a name
 
     @classmethod
     def read(cls, path: Path) -> LabelFile:

@@ -9,14 +9,14 @@ from pathlib import Path
 from rfm_client.options import counted
 from rfm_client.plot import save
 from rfm_labels.evaluation import LabelComparison
-from rfm_labels.label_files import read_provenance
+from rfm_labels.label_files import LabelFile
 
 WIDTH_IN = 7.0  # page width
 AXES_IN = 1.3  # height
 HEADLINE_IN = 0.5
 BINS = 20
 STYLE = "rfm_client.figure"  # the shared style file defines what each colour means
-SUCCESS_COLOUR, FAILURE_COLOUR = "C2", "C6"  # matplotlib's default colour shows progress
+SUCCESS_COLOUR, FAILURE_COLOUR = "C0", "C1"  # blue and orange, which colour-blind people tell apart
 
 
 def draw_evaluation(file: Path, comparison: LabelComparison, labels: Sequence[Path]) -> None:
@@ -60,6 +60,5 @@ def draw_evaluation(file: Path, comparison: LabelComparison, labels: Sequence[Pa
 
 def _origin(labels: Path) -> tuple[str, str]:
     """Return the dataset's and the checkpoint's source; the latter is empty if unknown."""
-    provenance = read_provenance(labels)
-    dataset, checkpoint = ((provenance.get(name) or {}).get("source") for name in ("dataset", "checkpoint"))
-    return dataset or labels.parent.name, checkpoint or ""
+    file = LabelFile.read(labels)
+    return (file.provenance.get("dataset") or {}).get("source") or labels.parent.name, file.checkpoint

@@ -113,13 +113,15 @@ def score(
     if output.prints_tables and shown:
         print("\n" + wrapped(prefix.rule, "  ", "  "))
     output.write_json(documents.score_document(server, video, prefix, outcomes))
+    caption = output.caption
+    if caption is None:
+        caption = scoring.heading(video.task, [outcome.checkpoint for outcome in shown])
     if output.plot is not None and shown:
-        save(scoring.figure(shown, video.task), output.plot)
+        save(scoring.figure(shown, caption, output.size), output.plot)
     if output.strips is not None and shown:
         from rfm_client.cli.pictures import plot
 
-        title = scoring.heading(video.task, [outcome.checkpoint for outcome in shown])
-        plot(output.strips, [outcome.panel for outcome in shown], title)
+        plot(output.strips, [outcome.panel for outcome in shown], caption, size=output.size)
     raise typer.Exit(scoring.exit_code_of_outcomes(outcomes))
 
 

@@ -30,7 +30,7 @@ from rfm_client.contract.errors import (
 from rfm_client.contract.results import FrameScores, ProgressResult
 from rfm_client.contract.samples import Trajectory
 from rfm_client.frames.sampling import Sampling
-from rfm_client.plot import plot_scores
+from rfm_client.plot import Size, plot_scores
 from rfm_client.recording import Recording
 from rfm_client.scoring.samples import CallOptions
 
@@ -219,7 +219,7 @@ def _evaluate(
 def checkpoint_of(client: RewardClient, trajectory: Trajectory) -> str:
     """Return where the checkpoint that scores the trajectory comes from, else the model's name."""
     info = client.model_info(frames=trajectory.frames is not None)
-    return info.source or info.name
+    return (info.source or info.name).removesuffix("/checkpoint")  # the folder of a run has a name
 
 
 def heading(task: str, checkpoints: Iterable[str]) -> str:
@@ -227,11 +227,12 @@ def heading(task: str, checkpoints: Iterable[str]) -> str:
     return "\n".join([*[f'"{task}"'] * (not is_blank(task)), ", ".join(dict.fromkeys(checkpoints))])
 
 
-def figure(scored: Sequence[Scored], task: str) -> Figure:
+def figure(scored: Sequence[Scored], title: str, size: Size) -> Figure:
     """Return one figure with these sources' curves. Raises ImportError without matplotlib."""
     return plot_scores(
         [each.result for each in scored],
         unique_stems([each.name for each in scored]),
-        title=heading(task, [each.checkpoint for each in scored]),
+        title=title,
         times_s=[each.times_s for each in scored],
+        size=size,
     )
