@@ -204,8 +204,7 @@ class LabelFile:
     def checkpoint(self) -> str:
         """Where the checkpoint comes from, else its digest; empty: unknown."""
         checkpoint = self.provenance.get("checkpoint") or {}
-        source = checkpoint.get("source") or checkpoint.get("weights_digest") or ""
-        return str(source).removesuffix("/checkpoint")  # the folder of a run has a name
+        return str(checkpoint.get("source") or checkpoint.get("weights_digest") or "")
 
     @classmethod
     def read(cls, path: Path) -> LabelFile:

@@ -9,7 +9,7 @@ from pathlib import Path
 from rfm_client.options import counted
 from rfm_client.plot import save
 from rfm_labels.evaluation import LabelComparison
-from rfm_labels.label_files import LabelFile
+from rfm_labels.label_files import read_provenance
 
 WIDTH_IN = 7.0  # page width
 AXES_IN = 1.3  # height
@@ -60,5 +60,6 @@ def draw_evaluation(file: Path, comparison: LabelComparison, labels: Sequence[Pa
 
 def _origin(labels: Path) -> tuple[str, str]:
     """Return the dataset's and the checkpoint's source; the latter is empty if unknown."""
-    file = LabelFile.read(labels)
-    return (file.provenance.get("dataset") or {}).get("source") or labels.parent.name, file.checkpoint
+    provenance = read_provenance(labels)
+    dataset, checkpoint = ((provenance.get(name) or {}).get("source") for name in ("dataset", "checkpoint"))
+    return dataset or labels.parent.name, checkpoint or ""

@@ -219,7 +219,9 @@ def _evaluate(
 def checkpoint_of(client: RewardClient, trajectory: Trajectory) -> str:
     """Return where the checkpoint that scores the trajectory comes from, else the model's name."""
     info = client.model_info(frames=trajectory.frames is not None)
-    return (info.source or info.name).removesuffix("/checkpoint")  # the folder of a run has a name
+    source = info.source or info.name
+    run = source.removesuffix("/checkpoint")  # a name, unless the folder is a version
+    return source if run.isdecimal() else run
 
 
 def heading(task: str, checkpoints: Iterable[str]) -> str:

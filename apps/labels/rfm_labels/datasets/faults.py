@@ -32,8 +32,8 @@ def listed(numbers: Iterable[int]) -> str:
 
 
 def named(number: int, name: str | None) -> str:
-    """Return an episode's number with its own name, if it has one: ``3 (red_cup.mp4)``."""
-    return f"{number} ({name})" if name else str(number)
+    """Return an episode's number with its own name, if that says more: ``3 (red_cup.mp4)``."""
+    return f"{number} ({name})" if name and name != str(number) else str(number)
 
 
 def shortened(lines: Sequence[str]) -> list[str]:

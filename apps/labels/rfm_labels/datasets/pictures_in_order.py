@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 
+from rfm_client.options import counted
 from rfm_labels.datasets.faults import DatasetError, require
 
 _NOT_IN_A_WORD = r"(?<![^\W_])"  # after a letter or digit, - and . are separators: frame-1.png, frame.1.png, 2026-11-26
@@ -72,7 +73,7 @@ def missing_numbers(files: Sequence[str]) -> str:
     gaps = [pair for pair, step in zip(itertools.pairwise(files), steps, strict=True) if step > usual]
     if not gaps or usual <= 0 or 2 * how_often < len(steps):
         return ""
-    more = f", and {len(gaps) - 1} more such gaps" if len(gaps) > 1 else ""
+    more = f", and {counted(len(gaps) - 1, 'more such gap')}" if len(gaps) > 1 else ""
     return f"no picture between {' and '.join(gaps[0])}{more}; were frames dropped while recording?"
 
 
