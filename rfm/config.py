@@ -166,6 +166,9 @@ class ServeConfig(Settings):
         **_COUNT,
     )
     triton_silent_s: int = setting(10, "Restart a Triton or gateway that does not answer for N seconds.", **_COUNT)
+    api_key_file: Path | None = setting(
+        None, "File with the key that callers need to score: at the gateway, over gRPC and over HTTP."
+    )
     grpc_certificate: Path | None = setting(
         None, "Serve gRPC with TLS and this certificate (PEM); HTTP then stays on 127.0.0.1."
     )

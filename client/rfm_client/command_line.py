@@ -6,7 +6,7 @@ Needs ``rfm-client[cli]``.
 
 from rfm_client.cli.command import Command, ExitCode, report, with_options
 from rfm_client.cli.options import JsonOutput, ServerOptions
-from rfm_client.cli.show import number, print_table
+from rfm_client.cli.show import number, print_facts, print_table
 
 __all__ = [
     "Command",
@@ -14,6 +14,7 @@ __all__ = [
     "JsonOutput",
     "ServerOptions",
     "number",
+    "print_facts",
     "print_table",
     "report",
     "with_options",

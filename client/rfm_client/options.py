@@ -1,7 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Declare settings for a command or configuration file, and check values. Applications build on it."""
 
-from rfm_client.contract.checks import checked_count, checked_finite, first_names, git_lfs_pointer, is_blank, require
+from rfm_client.contract.checks import (
+    checked_count,
+    checked_finite,
+    counted,
+    first_names,
+    git_lfs_pointer,
+    is_blank,
+    require,
+)
 from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.settings import ConfigError, Settings, setting
 
@@ -11,6 +19,7 @@ __all__ = [
     "Settings",
     "checked_count",
     "checked_finite",
+    "counted",
     "first_names",
     "git_lfs_pointer",
     "is_blank",

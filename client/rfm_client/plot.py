@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +33,23 @@ THRESHOLD: dict[str, Any] = {
 GRID: dict[str, Any] = {"color": "#dde2e6", "linewidth": 0.5, "zorder": 0}
 BOUNDS = (-0.03, 1.03)  # limits for an axis from 0 to 1
 
+
+class Canvas(NamedTuple):
+    """Width and height of a figure of a fixed shape, in inches of 8-point text, and its resolution."""
+
+    width_in: float
+    height_in: float
+    dpi: float
+
+    def scaled(self, by: float) -> Canvas:
+        """Return the canvas with more inches at the same number of pixels."""
+        return Canvas(self.width_in * by, self.height_in * by, self.dpi / by)
+
+
+Size: TypeAlias = Literal["paper", "slide", "square"]
+_CANVASES = {"slide": Canvas(16 / 3, 3, 360), "square": Canvas(4, 4, 270)}  # at least 1920 and 1080 pixels wide
+SCREEN_DPI = 100.0
+
 _WIDTH_IN = 3.5  # one column in a two-column layout
 _HEIGHT_IN = 1.5
 _SUCCESS_IN = 0.7
@@ -47,16 +65,18 @@ def plot_scores(
     *,
     title: str | None = None,
     times_s: Sequence[npt.NDArray[np.float64] | None] | None = None,
+    size: Size = "paper",
 ) -> Figure:
     """Return a figure with one progress curve per result and, where success is predicted, success curves below.
 
     Models that predict another score instead of progress, such as remaining seconds, get an axis in that unit.
 
-    The figure is light whatever style is set, and 3.5 inches wide. A dotted line marks success 0.5. ``save`` writes the
+    The figure is light whatever style is set. A dotted line marks success 0.5. ``save`` writes the
     figure. ``matplotlib.style.use("rfm_client.figure")`` gives other figures the same style.
 
     names: curve names for the legend; long names lose their middle
     times_s: per result float64 [T], the times of the T scored frames; the axis counts frames if any are unknown
+    size: paper: 3.5 inches wide, as high as needed; slide: 16:9; square: 1:1
 
     Raises ValueError for no results, for more than 40, and if the number of names or times differs; ImportError without
     matplotlib.
@@ -78,7 +98,11 @@ def plot_scores(
         colours = rcParams["axes.prop_cycle"].by_key()["color"]  # "C0" would follow a style set later
         columns = 2 if max(map(len, names)) <= _SHORT else 1
         lines_in = _LINE_IN * (-(-len(results) // columns) + 3 + (title or "").count("\n"))
-        figure = new_figure(figsize=(_WIDTH_IN, sum(heights_in) + lines_in), layout="constrained")
+        needed_in = sum(heights_in) + lines_in
+        canvas = Canvas(_WIDTH_IN, needed_in, SCREEN_DPI)
+        if size != "paper":
+            canvas = canvas_of(size, lambda each: each.height_in >= needed_in)
+        figure = new_figure(figsize=canvas[:2], dpi=canvas.dpi, layout="constrained")
         axes = figure.subplots(len(heights_in), 1, sharex=True, squeeze=False, height_ratios=heights_in)[:, 0]
         for ax, score in zip(axes, scores, strict=True):
             for number, (result, x) in enumerate(zip(results, positions, strict=True)):
@@ -104,6 +128,11 @@ def plot_scores(
     return figure
 
 
+def canvas_of(size: Size, fits: Callable[[Canvas], bool]) -> Canvas:
+    """Return the canvas of a slide or square, enlarged until the contents fit, so that text looks smaller."""
+    return next(filter(fits, (_CANVASES[size].scaled(quarters / 4) for quarters in itertools.count(4))))
+
+
 @contextmanager
 def drawing() -> Iterator[type[Figure]]:
     """Set the style, and yield matplotlib's class for figures. Raises ImportError, naming the extra to install."""
@@ -117,10 +146,12 @@ def drawing() -> Iterator[type[Figure]]:
 
 
 def save(figure: Figure, file: Path | str) -> None:
-    """Write a figure in the format given by the file suffix, such as .png (200 dots per inch), .pdf or .svg."""
+    """Write a figure in the format given by the file suffix, such as .png (200 dots per inch or more), .pdf or .svg."""
     with drawing(), warnings.catch_warnings():
+        from matplotlib import rcParams
+
         warnings.filterwarnings("ignore", message="Glyph")  # letters missing from the font appear as boxes
-        figure.savefig(file)
+        figure.savefig(file, dpi=max(figure.dpi, rcParams["savefig.dpi"]))
 
 
 def _shortened(name: str) -> str:

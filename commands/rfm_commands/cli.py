@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import typer
 
 from rfm.config import ExportConfig, ServeConfig
-from rfm.serve.access import NO_KEY, Endpoints, new_key, take_key
+from rfm.serve.access import NO_KEY, Endpoints, callers_restrictions, new_key, read_key, take_key
 from rfm.serve.installation import ServerStartError, find_installation, has_gpu, without_gpus
 from rfm.serve.supervisor import CrashLoopError, GatewayProcess, Supervisor
 from rfm.serve.triton_server import TritonServer, short_spin
@@ -178,6 +178,9 @@ def serve(
     if not has_gpu():
         more_arguments = [*without_gpus(more_arguments), *more_arguments]
     config = _config(config_file, serve=given, gateway=gateway_given)
+    key_file = config.serve.api_key_file
+    api_key = None if key_file is None else read_key(key_file, "--api-key-file")
+    more_arguments = [*callers_restrictions(api_key, more_arguments), *more_arguments]
     if gateway_given and config.gateway.port is None:
         option = GatewayBeside.settings()[next(iter(gateway_given))].option
         raise typer.BadParameter(f"{option} needs --gateway-port, which starts the gateway")
@@ -194,6 +197,7 @@ def serve(
             http_threads=config.serve.http_threads,
             log=lines,
             admin_key=take_key(admin_key_file, os.environ) or new_key(),
+            api_key=api_key,
             accepts_known_vulnerabilities=accept_known_vulnerabilities,
             more_arguments=more_arguments,
             hang_s=config.serve.hang_s,
@@ -205,7 +209,9 @@ def serve(
         if is_open and not (asked.grpc_any_client or asked.is_loopback):
             expected = f"client certificates (--grpc-client-ca) at {asked.host}, since TLS alone asks for nothing"
             fail(f"--grpc-certificate: expected {expected}, got none; --grpc-any-client serves everyone")
-        screen = ServeScreen(folder, endpoints, found, log) if log is not None and sys.stderr.isatty() else None
+        screen = None
+        if log is not None and sys.stderr.isatty():
+            screen = ServeScreen(folder, endpoints, found, log, key_file)
         supervisor = Supervisor(
             server,
             gateway=None if beside is None else _gateway_process(beside, config),
@@ -276,8 +282,11 @@ def _beside(server: TritonServer, config: Config, given: OptionValues[GatewayBes
         triton=gateway.triton or (behind.grpc_url if behind.grpc_tls is None else behind.http_url),
         metrics_url=gateway.metrics_url or behind.metrics_url,
         model=gateway.model or config.export.name,
+        triton_api_key_file=gateway.triton_api_key_file or (None if gateway.triton else config.serve.api_key_file),
     )
     try:
+        if filled.api_key(os.environ) is None:
+            filled = replace(filled, api_key_file=config.serve.api_key_file)
         check_gateway(filled, os.environ)
     except ConfigError as error:
         fail(str(error.named(partial(named_as_typed, "gateway", given)) if error.where in filled.settings() else error))

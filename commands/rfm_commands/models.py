@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +36,6 @@ class AdministeredServer(CredentialFiles):
     """A running server whose models are listed or change."""
 
     TITLE: ClassVar[str] = "Server"
-    NO_OPTION: ClassVar[Collection[str]] = {"api_key_file"}
 
     url: str = setting(
         "grpc://127.0.0.1:8001", "grpc://host:port of the server, with TLS grpcs://host:port.", variable="RFM_URL"
@@ -53,7 +52,7 @@ class AdministeredServer(CredentialFiles):
         with usage_errors("--url"):
             if len(self.url.split()) > 1:
                 raise InvalidValueError(f"expected one server, got {self.url}")
-            server = RepositoryApi(self.url, key, options)
+            server = RepositoryApi(self.url, key, options, headers=self.credentials.shown)
         with server as api:
             yield api
 

@@ -79,12 +79,14 @@ class ServeScreen:
 
     doors: as ``doors`` returns them
     log: file with Triton's lines
+    key_file: file with the key that all ports ask for; None: none
     """
 
     repository: Path
     endpoints: Endpoints
     doors: Mapping[str, tuple[str, str]]
     log: Path
+    key_file: Path | None = None
     _began_s: float = field(default_factory=time.monotonic)
 
     def show_start(self) -> None:
@@ -132,6 +134,7 @@ class ServeScreen:
         shown = [] if tls is None else ["--ca-file", "AUTHORITY.pem"]
         if tls is not None and tls.client_ca is not None:
             shown += ["--client-certificate", "CERTIFICATE.pem", "--client-key", "KEY.pem"]
+        shown += [] if self.key_file is None else ["--api-key-file", str(self.key_file)]
         models = models_in(self.repository)
         scorers = [name for name in names_of(self.repository) if frames_name(name) in models]
         purpose, score = score_step(here.grpc_url, scorers, *shown)

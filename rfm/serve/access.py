@@ -19,15 +19,16 @@ from rfm.serve.installation import ServerStartError
 from rfm_client.contract.addresses import ListenAddress, check_authorities, check_certificate, in_url, is_loopback
 from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidValueError
+from rfm_client.contract.triton import AUTHORIZATION, METADATA_PREFIX
 from rfm_client.contract.wire import ADMIN_KEY_VARIABLE
 
 VARIABLE = ADMIN_KEY_VARIABLE
 HEADER = "rfm-admin-key"
 MIN_CHARACTERS = 16
-_GRPC_PREFIX = "triton-grpc-protocol-"  # Triton puts it before the header name
 _RESTRICTED = "model-repository,logging,trace"
 _RESTRICTIONS = {"HTTP": "http-restricted-api", "gRPC": "grpc-restricted-protocol"}  # tritonserver's options
 _SCORING = "inference"  # the restricted API
+_OF_CALLERS = f"{_SCORING},shared-memory"  # the APIs that callers use with the API key; health and names need none
 NO_KEY, KEY, CERTIFICATE = "no key needed", "needs a key", "needs a client certificate"  # what a port's callers need
 _RANDOM_BYTES = 32
 _VISIBLE = re.compile("[!-~]*")  # characters that a header can carry unchanged
@@ -39,19 +40,37 @@ def new_key() -> str:
 
 
 def take_key(file: Path | None, environment: MutableMapping[str, str]) -> str | None:
-    """Return the key in ``file``, else the key in ``environment``, else None. Raises InvalidValueError.
+    """Return the admin key in ``file``, else the one in ``environment``, else None. Raises InvalidValueError.
 
     Removes the key from ``environment``, so that no child process inherits it.
     """
     given = environment.pop(VARIABLE, None)
     if file is not None:
-        return _checked(_read(file), f"--admin-key-file: {file}")
+        return read_key(file, "--admin-key-file")
     return None if given is None else _checked(given, VARIABLE)
 
 
 def restrictions(key: str) -> list[str]:
     """Return tritonserver arguments that refuse administrative requests without ``key``."""
     return [f"--{option}={_RESTRICTED}:{HEADER}={key}" for option in _RESTRICTIONS.values()]
+
+
+def callers_restrictions(key: str | None, given: Sequence[str]) -> list[str]:
+    """Return tritonserver arguments that refuse callers without ``Authorization: Bearer KEY``. None: no key
+
+    given: other arguments; where they restrict scoring themselves, they win
+    """
+    return [
+        f"--{option}={_OF_CALLERS}:{AUTHORIZATION}=Bearer {key}"
+        for option in _RESTRICTIONS.values()
+        if key is not None and not _asks_callers(option, given)
+    ]
+
+
+def _asks_callers(option: str, arguments: Sequence[str]) -> bool:
+    """True if one of the arguments is this option and restricts scoring."""
+    given = (each.partition("=")[2] for each in arguments if each.startswith(f"--{option}="))
+    return any(_SCORING in each.partition(":")[0].split(",") for each in given)
 
 
 def http_headers(key: str | None) -> Mapping[str, str]:
@@ -61,28 +80,27 @@ def http_headers(key: str | None) -> Mapping[str, str]:
 
 def grpc_metadata(key: str | None) -> Mapping[str, str]:
     """Return the gRPC metadata for a restricted API."""
-    return {} if key is None else {f"{_GRPC_PREFIX}{HEADER}": key}
+    return {} if key is None else {f"{METADATA_PREFIX}{HEADER}": key}
 
 
-def _read(file: Path) -> str:
+def read_key(file: Path, option: str) -> str:
     """Return the key from a file with permissions as strict as PostgreSQL requires for a private key.
 
     Only the owner may read the file. If root owns it, the group may too: containers get secrets that way.
+    Raises InvalidValueError, which names the option.
     """
     try:
         status = file.stat()
-        require("--admin-key-file", stat.S_ISREG(status.st_mode), "a file", f"{file}, which is none")
+        require(option, stat.S_ISREG(status.st_mode), "a file", f"{file}, which is none")
         expected = 0o640 if status.st_uid == 0 else 0o600
         mode = stat.S_IMODE(status.st_mode)
         if mode & ~expected:
             owner = "root's file" if status.st_uid == 0 else "file"
-            raise InvalidValueError.at(
-                f"--admin-key-file: {file}", f"mode {expected:o} or less of a {owner}", f"{mode:o}"
-            )
-        return file.read_text()
+            raise InvalidValueError.at(f"{option}: {file}", f"mode {expected:o} or less of a {owner}", f"{mode:o}")
+        return _checked(file.read_text(), f"{option}: {file}")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "no text"
-        raise InvalidValueError.at("--admin-key-file", f"a text file at {file}", reason) from None
+        raise InvalidValueError.at(option, f"a text file at {file}", reason) from None
 
 
 def _checked(text: str, where: str) -> str:
@@ -182,10 +200,7 @@ class Endpoints:
         asks = dict.fromkeys(("gRPC", "HTTP", "metrics"), NO_KEY)
         if self.grpc_tls is not None and self.grpc_tls.client_ca is not None:
             asks["gRPC"] = CERTIFICATE
-        for name, option in _RESTRICTIONS.items():
-            given = (each.partition("=")[2] for each in more_arguments if each.startswith(f"--{option}="))
-            if any(_SCORING in each.partition(":")[0].split(",") for each in given):
-                asks[name] = KEY
+        asks |= {name: KEY for name, option in _RESTRICTIONS.items() if _asks_callers(option, more_arguments)}
         urls = {"gRPC": self.grpc_url, "HTTP": self.http_url, "metrics": self.metrics_url}
         return {name: (url, asks[name]) for name, url in urls.items()}
 

@@ -15,7 +15,7 @@ import tritonclient.grpc
 from google.protobuf.json_format import MessageToDict
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
-from rfm.serve.access import VARIABLE, grpc_metadata
+from rfm.serve.access import HEADER, VARIABLE, grpc_metadata
 from rfm_client.contract import triton
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.checks import require
@@ -72,20 +72,34 @@ class ModelVersion:
         return self.state == _NOT_LOADED or (self.state, self.reason) == (_UNAVAILABLE, _UNLOADED)
 
 
+_KEYS = (  # what an administrator's and a caller's request show, in which header, and where it comes from
+    ("admin key", HEADER, f"--admin-key-file or {VARIABLE}"),
+    ("API key", triton.AUTHORIZATION, "--api-key-file or RFM_API_KEY_FILE"),
+)
+
+
 class RepositoryApi:
     """Client for the server at ``url``: grpc://host:port, or grpcs:// with TLS. A context manager.
 
     options: for tritonclient's gRPC client, such as those from Credentials
+    headers: sent with each request, such as an API key that the server asks of callers
 
     The constructor raises InvalidValueError for an unusable URL, the methods raise RepositoryApiError.
     """
 
-    def __init__(self, url: str, admin_key: str | None, options: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self,
+        url: str,
+        admin_key: str | None,
+        options: Mapping[str, Any] | None = None,
+        *,
+        headers: Mapping[str, str] | None = None,
+    ) -> None:
         scheme, address = split_url(url)
         expected = "grpc://host:port (its gRPC port, 8001) or with TLS grpcs://host:port"
         require("url", scheme in ("grpc", "grpcs"), expected, url)
         self._url = url
-        self._headers = grpc_metadata(admin_key)
+        self._headers = {**grpc_metadata(admin_key), **(headers or {})}
         given = dict(options or {})
         channel = [*_CHANNEL, *given.pop("channel_args", ())]
         self._client = tritonclient.grpc.InferenceServerClient(address, channel_args=channel, **given)
@@ -134,15 +148,15 @@ class RepositoryApi:
         )
         return {name: answer.as_numpy(name) for name in outputs}
 
-    def _request(self, call: Any, *arguments: Any, **options: Any) -> Any:
+    def _request(self, call: Any, *arguments: Any, **more: Any) -> Any:
         try:
-            return call(*arguments, headers=self._headers, client_timeout=ANSWER_S, **options)
+            return call(*arguments, headers=self._headers, client_timeout=ANSWER_S, **more)
         except InferenceServerException as error:
             message = one_line(error.message() or "no reason given")
             if triton.RESTRICTED in message:
-                got = "another" if self._headers else "none"
-                expected = f"that of the server at {self._url} (--admin-key-file or {VARIABLE})"
-                raise RepositoryApiError.at("admin key", expected, got) from None
+                key, header, options = _KEYS[call == self._client.infer]
+                got = "another" if f"{triton.METADATA_PREFIX}{header}" in self._headers else "none"
+                raise RepositoryApiError.at(key, f"that of the server at {self._url} ({options})", got) from None
             ours = triton.error_from(error, self._url)
             if isinstance(ours, ServerUnavailableError) and ours.remedy and message not in str(ours):  # no connection
                 raise RepositoryApiError(str(ours)) from error

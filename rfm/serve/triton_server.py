@@ -33,6 +33,7 @@ from rfm.serve.processes import (
 )
 from rfm.serve.repository import Config, check_models, models_in, no_models, stage
 from rfm.serve.repository_api import INDEX_PATH, versions_of
+from rfm_client.contract.triton import bearer_headers
 
 MAX_HTTP_BYTES = 256 * 2**20  # for a request body; gRPC accepts 2 GiB
 # Refused besides the options that rfm serve sets: their aliases, and options that break a start.
@@ -126,6 +127,7 @@ class TritonServer:
     hang_s: a model without progress for this long counts as hung; in a batch, its process ends itself
     log: file for Triton's log; None: warnings and errors go to this process's standard error
     admin_key: key for the restricted APIs; default: a new random key
+    api_key: key that ``more_arguments`` ask of callers; None: none
     accepts_known_vulnerabilities: True: listen on any address, even with a vulnerable Triton
     more_arguments: further tritonserver arguments, such as ``--trace-config=...``
     """
@@ -138,11 +140,13 @@ class TritonServer:
     hang_s: int = DEFAULT_HANG_S
     log: IO[bytes] | None = None
     admin_key: str = field(default_factory=new_key, repr=False)
+    api_key: str | None = field(default=None, repr=False)
     accepts_known_vulnerabilities: bool = False
     more_arguments: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        self.http = Http(self.endpoints.http_host, self.endpoints.http_port, http_headers(self.admin_key))
+        headers = {**http_headers(self.admin_key), **(bearer_headers(self.api_key) if self.api_key else {})}
+        self.http = Http(self.endpoints.http_host, self.endpoints.http_port, headers)
         self._claim: Claim | None = None
         self._signal: int | None = None  # the last signal sent
         self._group: ProcessGroup | None = None  # the newest

@@ -197,9 +197,31 @@ def test_a_plot_has_a_strip_for_each_video_and_is_drawn_without_scores_too(tmp_p
     drawn = (tmp_path / "plot.svg").read_text()
     corners = re.findall(r'id="image[^>]* x="([\d.]+)" y="[^"]*" width="([\d.]+)"', drawn)
     middles = np.array([float(x) + float(width) / 2 for x, width in corners])
-    frames_shown = (middles - middles[0]) / (middles[-1] - middles[0]) * 11
-    np.testing.assert_allclose(frames_shown, [0, 2, 4, 7, 9, 11], atol=0.02)  # they stand at their times
+    np.testing.assert_array_equal(panels[0].strip_positions, [0, 2, 4, 7, 9, 11])
+    np.testing.assert_allclose(middles, np.linspace(middles[0], middles[-1], 6), atol=0.2)
     assert (np.diff(middles) >= float(corners[0][1])).all()
+
+
+SHAPES = {"slide": (1920, 1080), "square": (1080, 1080)}
+
+
+@pytest.mark.parametrize(("size", "pixels"), SHAPES.items())
+def test_a_slide_and_a_square_keep_their_shape_with_any_number_of_videos(
+    engines: EngineServer, video: Path, tmp_path: Path, size: Any, pixels: tuple[int, int]
+) -> None:
+    told = FrameScores(progress=np.linspace(0, 1, 12, dtype=np.float32), success=np.zeros(12, np.float32))
+    panel = Panel.of("[frames]", told, np.zeros((12, 8, 8, 3), np.uint8))
+    for count in (1, 3):
+        plot(tmp_path / "strips.png", [panel] * count, "a title", size=size)
+        with Image.open(tmp_path / "strips.png") as strips:
+            assert strips.size == pixels or (count > 1 and strips.height > pixels[1])  # with smaller text
+            assert strips.width / strips.height == pytest.approx(pixels[0] / pixels[1], abs=1e-3)
+    asked = ("--plot", tmp_path / "plot.svg", "--size", size, "--caption", "how it went")
+    assert ask(engines, "score", video, "--task", TASK, *asked).exit_code == 0
+    drawn = (tmp_path / "plot.svg").read_text()
+    width, height = re.findall(r'(?:width|height)="([\d.]+)pt"', drawn)[:2]
+    assert float(width) / float(height) == pytest.approx(pixels[0] / pixels[1])
+    assert "<!-- how it went -->" in drawn and TASK not in drawn
 
 
 @pytest.mark.parametrize(

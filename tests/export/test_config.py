@@ -227,7 +227,8 @@ def test_every_setting_of_a_gateway_is_an_option_of_serve(started: Any, tmp_path
         "max_waiting": "0",
         "dataset": str(LEROBOT / "toy_v21"),
     }
-    files = {"certificate", "key", "triton_ca_file", "triton_certificate", "triton_key"}  # which a gateway would read
+    files = {"certificate", "key"}  # which a gateway would read
+    files |= {f"triton_{name}" for name in ("ca_file", "certificate", "key", "api_key_file")}
     switches = {"viewer", "use_frame_steps", "refuse_blank"}
     assert given.keys() | files | switches == GatewayConfig.settings().keys()
     options = {GatewayConfig.settings()[name].option: [value] for name, value in given.items()}

@@ -79,9 +79,9 @@ def test_a_dry_run_writes_its_doubts_as_json(tmp_path: Path, capsys: pytest.Capt
     assert LabelCommand(str(root), EpisodeTexts(), options, run, RayOptions(), connect, str).run() == 0
     document = json.loads(capsys.readouterr().out)
     assert [each["text"] for each in document["doubts"]] == [
-        "1 files that no episode uses: videos/chunk-000/observation.images.front/episode_000099.mp4; left from a recording "
+        "1 file that no episode uses: videos/chunk-000/observation.images.front/episode_000099.mp4; left from a recording "
         "that was written again?",
-        "next.success: 1 episodes without an outcome: 3",
+        "next.success: 1 episode without an outcome: 3",
         "outcome: success: episode 0: expected true, false, 1, 0, success or failure, got 0.5",
     ]
     assert (document["episodes"], document["cameras"]) == (len(open_dataset(root).episodes), [FRONT])

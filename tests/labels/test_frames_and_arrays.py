@@ -48,7 +48,7 @@ def test_a_table_names_folders_their_tasks_and_their_order(folders: Path, column
         ("10", "open the box", COUNT),
         ("11/front", TASK, 3),
     ]
-    assert dataset.notes == ["tasks.csv: 2 folders of pictures beside it are not listed and get no labels: 0, 2"]
+    assert dataset.notes == ["tasks.csv leaves out folders of pictures beside it, which get no labels: 0, 2"]
     (folders / "tasks.csv").write_text(f"{column},task\n2/frame_*.png,{TASK}\n")
     with pytest.raises(
         DatasetError, match=r"got 2/frame_\*\.png: name the pictures by --videos '{episode}/frame_\*\.png'"

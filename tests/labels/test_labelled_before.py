@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
@@ -14,6 +15,7 @@ import pytest
 from pyarrow import parquet
 
 from hdf5_writers import video, write_robomimic
+from in_process import rfm_client
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes, command
 from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 
@@ -106,7 +108,7 @@ def test_labels_of_another_recipe_are_refused_with_the_setting_that_differs(
 
     notes = Notes()
     label(dataset, scorer, LabelOptions(**{**changed, "overwrite": True}), notes)
-    assert f"--overwrite: {got}; its labels of 1 episodes are replaced" in notes.lines
+    assert f"--overwrite: {got}; its labels of 1 episode are replaced" in notes.lines
     assert parquet.read_table(output / PROGRESS)["episode_index"].unique().to_pylist() == [3]
 
 
@@ -154,3 +156,35 @@ def test_labels_of_another_program_stay_unless_overwriting_is_requested(
     assert labels(output) == before
     labelled(TOY, output, limit=2, alias="sarm_progress", overwrite=True)
     assert labels(output)["sarm_progress.parquet"] == labels(output)[PROGRESS]
+
+
+def test_labels_are_listed_and_deleted_by_name_and_finished_episodes_stay(output: Path) -> None:
+    for name in ("rfm", "other"):
+        labelled(TOY, output, name=name, episodes=[0])
+    before = labels(output)
+    remove = ("label", TOY, "--output", output, "--remove", "rfm")
+    with (output / f".{PROGRESS}.{os.getuid()}.tmp").open("ab") as writing:  # as a run that writes the file
+        fcntl.flock(writing, fcntl.LOCK_EX)
+        refused = rfm_client(*remove)
+        assert "expected no run that writes it, got one" in refused.stderr
+    assert labels(output) == before
+    done = rfm_client(*remove)
+    assert done.stdout.splitlines() == [
+        f"deleted {output / file}, labels of 1 episode by toy/brightness"
+        for file in (PROGRESS, "reward_signals/rfm.parquet")
+    ]
+    assert labels(output).keys() == {name for name in before if "other" in name}
+    assert labelled(TOY, output, episodes=[0])[0] == 0
+    assert labels(output) == before
+    (output / "third_progress.parquet").write_bytes(b"of another program")
+    listed = rfm_client("label", TOY, "--output", output, "--list").stdout.splitlines()[2:]
+    assert [line.split() for line in listed if line] == [
+        ["rfm", "toy/brightness", "1"],
+        ["other", "toy/brightness", "1"],
+        ["third", "-", "-"],
+    ]
+    shutil.rmtree(output / ".rfm_parts")
+    assert "expected --yes for labels that must be scored again" in rfm_client(*remove).stderr
+    assert (output / PROGRESS).exists()
+    assert rfm_client(*remove, "--yes").exit_code == 0
+    assert "expected labels of rfm-client, got others" in rfm_client(*remove[:-1], "third").stderr

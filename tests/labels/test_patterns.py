@@ -120,7 +120,8 @@ def test_a_table_gives_tasks_and_the_order_and_others_are_listed(tmp_path: Path)
         (first, "close it"),
     ]
     assert any(
-        "1 episodes beside it are not listed and get no labels: observations/328/1" in each for each in notes.lines
+        "tasks.csv leaves out episodes beside it, which get no labels: observations/328/1" in each
+        for each in notes.lines
     )
     (tmp_path / "tasks.csv").write_text(f"episode,task\n{second},open it\ngone,close it\n")
     with pytest.raises(DatasetError, match=r"tasks\.csv: expected episodes of .*, got gone; there are observations"):

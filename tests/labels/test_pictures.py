@@ -16,6 +16,7 @@ from PIL import Image, ImageOps, PngImagePlugin
 from pictures import numbered, numbers
 from rfm_client import UInt8Array
 from rfm_labels import DatasetError, open_dataset
+from rfm_labels.audit import audit
 from rfm_labels.datasets.pictures_in_order import in_order_of_numbers
 from rfm_labels.datasets.stored_files import digest_of, file_identity
 
@@ -66,6 +67,21 @@ IN_ORDER: dict[str, Sequence[str]] = {
 def test_numbers_in_names_order_the_frames(tmp_path: Path, names: Sequence[str]) -> None:
     assert in_order_of_numbers(tmp_path, sorted(names, reverse=True)) == list(names)
     assert order(stored(tmp_path / "pictures", names), len(names)) == list(range(len(names)))
+
+
+SKIPPING = {  # names of pictures, and the pictures around a gap
+    "a count": (["f_0001.png", "f_0002.png", "f_0004.png"], "f_0002.png and f_0004.png;"),
+    "every fifth": (["0.png", "5.png", "10.png", "25.png", "30.png", "40.png"], "10.png and 25.png, and 1 more"),
+    "times of a clock": ([f"{ms}.png" for ms in (1000, 1031, 1068, 1101, 1190)], None),
+}
+
+
+@pytest.mark.parametrize(("names", "told"), SKIPPING.values(), ids=SKIPPING)
+def test_a_dry_run_doubts_missing_numbers(tmp_path: Path, names: Sequence[str], told: str | None) -> None:
+    dataset = open_dataset(stored(tmp_path, names), task=TASK)
+    doubts = [str(each) for each in audit(dataset, dataset.episodes, dataset.cameras) if "no picture" in each.text]
+    assert len(doubts) == (told is not None)
+    assert all(doubt.startswith(f"episode 0: frames: no picture between {told}") for doubt in doubts)
 
 
 def of_cameras(pattern: str, cameras: Sequence[object], count: int = 3) -> list[str]:

@@ -285,10 +285,10 @@ def test_label_and_evaluate_take_a_reader_by_its_name(folder: Path, capsys: pyte
     again = BrightnessScorer()
     assert command(folder, LabelOptions(), again, reader=reader) == ExitCode.OK
     assert again.num_samples == 0
-    capsys.readouterr()
+    assert "2: 0 (a), 1 (b)" in capsys.readouterr().out
     done = invoke("evaluate", folder, "--outcome", reader)
     assert done.exit_code == 0, done.output
-    assert "2 episodes: 1 successes, 1 failures" in done.stdout
+    assert "2 episodes: 1 success, 1 failure" in done.stdout
     np.save(folder / "0.npy", CLIPS[0])  # now the first episode
     done = invoke("evaluate", folder, "--outcome", reader)
     assert "outcome: episode 0: expected a, got 0: label again, and yield new recordings last" in done.stderr

@@ -97,7 +97,7 @@ def test_each_stretch_of_frames_is_scored_as_an_episode_of_its_task(
     np.testing.assert_allclose(table["progress"].to_numpy()[: len(means)], means - since, atol=1e-5)
     assert table["frame_index"].to_pylist()[: len(means)] == list(range(len(means)))
     assert set(scorer.asked) == {sentences[0], sentences[4], dataset.episode(1).task}
-    assert [line for line in notes.lines if line.startswith("tasks: 1 episodes have several: each stretch")]
+    assert [line for line in notes.lines if line.startswith("tasks: several in 1 episode: each stretch")]
 
 
 def gains(table: Any, chunk: int) -> list[float]:

@@ -105,7 +105,7 @@ def test_frames_before_the_first_subtask_get_the_callers_task(tmp_path: Path, ou
     assert dataset.episode(0).tasks == IN_TWO
     notes = Notes()
     label(dataset, BrightnessScorer(), LabelOptions(output=output, episodes=[0, 1], **FEW), notes)
-    assert "tasks: 0 episodes keep their own sentence, 2 get --task" in notes.lines
+    assert "tasks: their own for 0 episodes, --task for 2" in notes.lines
 
 
 CANDIDATES = "expected one of task_index, annotation.human.coarse_action, language_persistent, got "
@@ -195,7 +195,7 @@ def test_a_note_says_that_an_override_is_the_task_of_all_episodes(output: Path) 
     notes = Notes()
     dataset = open_dataset(V21, task="stack the cups", override_task=True)
     label(dataset, BrightnessScorer(), LabelOptions(output=output, limit=3, **FEW), notes)
-    assert [line for line in notes.lines if line.startswith("tasks:")] == ["tasks: all 3 episodes get --task"]
+    assert [line for line in notes.lines if line.startswith("tasks:")] == ["tasks: --task for all 3 episodes"]
 
 
 def test_episode_numbers_may_have_gaps_and_lie_in_several_chunks(tmp_path: Path) -> None:

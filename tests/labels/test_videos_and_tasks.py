@@ -61,7 +61,7 @@ def test_videos_missing_from_the_table_are_listed(videos: Path, output: Path) ->
     (videos / "elsewhere" / "d.mp4").write_bytes(b"of no listed folder")
     notes = Notes()
     label(open_dataset(videos), BrightnessScorer(), LabelOptions(output=output), notes)
-    line = "tasks.csv: 2 videos beside it are not listed and get no labels: b.mp4, day/c.mp4"
+    line = "tasks.csv leaves out videos beside it, which get no labels: b.mp4, day/c.mp4"
     assert [each for each in notes.lines if "tasks.csv" in each] == [line]
     (videos / "tasks.csv").write_text("video,task\nb.mp4,a b\nday/a.mp4,open the box\nday/c.mp4,c d\n")
     assert not open_dataset(videos).notes

@@ -102,7 +102,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     clip.write(tmp_path / "recordings" / "0" / "videos" / "front.mp4")
     for t, frame in enumerate(pictures(7)):
         Image.fromarray(frame).save(tmp_path / "recordings" / "0" / "colors" / f"{t}_front.jpg")
-    np.savez(tmp_path / "recordings" / "0.npz", frames=pictures(8), goal="stack the cups", success=True)
+    np.savez(tmp_path / "recordings" / "0.npz", frames=pictures(8), task="stack the cups")
     (tmp_path / "recordings" / "tasks.csv").write_text("episode,task\n0,stack the cups\n")
     (reader,) = re.findall(r"^```python\n(# my_reader\.py.*?)^```", READER_GUIDE.read_text(), re.MULTILINE | re.DOTALL)
     (tmp_path / "my_reader.py").write_text(reader)

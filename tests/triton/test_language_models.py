@@ -316,8 +316,7 @@ def test_remaining_seconds_are_shown_in_tables_pictures_and_on_the_page(
     output = asked.command("score", VIDEO, "--task", TASK, *rule, *pictures, model="rynn")
     (told,) = json.loads((tmp_path / "scores.json").read_text())["videos"]
     seconds, page = told["remaining_s"], quiet_browser
-    assert f"{seconds[-1]:.2f} s" in output
-    assert "In s, in place of progress: seconds that remain until the task is done." in output
+    assert {"remaining", "(s)", f"{seconds[-1]:.2f}"} <= {*output.split()}
     endpoints = Endpoints(grpc_port=int(asked.url.rpartition(":")[2]))
     with running(endpoints, tmp_path, "rynn") as gateway:
         page.open(gateway.url)

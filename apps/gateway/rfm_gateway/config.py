@@ -68,6 +68,7 @@ class GatewayConfig(Settings):
     triton_ca_file: Path | None = setting(None, "Certificate authorities (PEM) for Triton. Default: the system's.")
     triton_certificate: Path | None = setting(None, "Client certificate (PEM) for Triton.")
     triton_key: Path | None = setting(None, "That certificate's key (PEM).")
+    triton_api_key_file: Path | None = setting(None, "File with the API key for Triton. Default: none.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -92,10 +93,12 @@ class GatewayConfig(Settings):
     @property
     def credentials(self) -> Credentials:
         """Credentials for Triton. Raises ConfigError for unusable files."""
+        key = self._key_in("triton_api_key_file")
         try:
-            return Credentials(self.triton_ca_file, self.triton_certificate, self.triton_key)
+            return Credentials(self.triton_ca_file, self.triton_certificate, self.triton_key, api_key=key)
         except ConfigError as error:
-            raise error.named(lambda name: f"triton_{name.removeprefix('client_')}") from None
+            names = {"api_key": "api_key_file"}
+            raise error.named(lambda name: f"triton_{names.get(name, name.removeprefix('client_'))}") from None
 
     @property
     def address(self) -> ListenAddress:
@@ -144,10 +147,15 @@ class GatewayConfig(Settings):
 
     def api_key(self, environment: Mapping[str, str]) -> str | None:
         """Return the key that requests must show, or None. Raises ConfigError."""
-        try:
-            key = environment.get(KEY_VARIABLE) if self.api_key_file is None else self.api_key_file.read_text()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError.at("api_key_file", "a text file", error) from None
+        key = environment.get(KEY_VARIABLE) if self.api_key_file is None else self._key_in("api_key_file")
         if key is not None and not key.strip():
             raise ConfigError.at("api_key_file", f"a key, here or in {KEY_VARIABLE}", "no character")
         return None if key is None else key.strip()
+
+    def _key_in(self, name: str) -> str | None:
+        """Return the key in a setting's file; None: no file. Raises ConfigError."""
+        file: Path | None = getattr(self, name)
+        try:
+            return None if file is None else file.read_text().strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError.at(name, "a text file", error) from None

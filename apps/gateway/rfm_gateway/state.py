@@ -30,7 +30,8 @@ MS_PER_S = 1e3
 
 
 _REMEDIES = {  # for callers over HTTP, who do not have the client's options
-    AccessDeniedError: "whoever runs the gateway sets --triton-ca-file, --triton-certificate and --triton-key",
+    AccessDeniedError: "whoever runs the gateway sets --triton-ca-file, --triton-certificate, --triton-key or "
+    "--triton-api-key-file",
     ModelNotFoundError: "retry if the server restarts; else whoever runs the gateway names a served model with --model",
     ServerUnavailableError: "whoever runs the gateway starts Triton there (rfm serve does so by itself: retry), or "
     "names another with --triton",

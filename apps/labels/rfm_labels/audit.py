@@ -10,9 +10,9 @@ import numpy as np
 
 from rfm_client import UInt8Array
 from rfm_client.frames import BlankFrames
-from rfm_client.options import first_names
+from rfm_client.options import counted, first_names
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
-from rfm_labels.datasets.faults import DatasetError, listed
+from rfm_labels.datasets.faults import DatasetError, listed, named
 from rfm_labels.options import QUIET, Watch
 from rfm_labels.outcomes import read_outcomes
 
@@ -24,27 +24,37 @@ _OUTCOMES = ("next.success", "success", "is_success")  # columns
 
 @dataclass(frozen=True)
 class Doubt:
-    """Something that may be a fault. episode, camera: None: of the whole dataset, or of all cameras"""
+    """Something that may be a fault.
+
+    episode, camera: None: of the whole dataset, or of all cameras
+    name: the episode's own; None: it has none
+    """
 
     text: str
     episode: int | None = None
     camera: str | None = None
+    name: str | None = None
+
+    @classmethod
+    def of(cls, text: str, episode: DatasetEpisode, camera: str) -> Doubt:
+        """Return a doubt about a camera's frames in an episode."""
+        return cls(text, episode.index, camera, episode.own_name)
 
     def __str__(self) -> str:
-        places = [] if self.episode is None else [f"episode {self.episode}"]
+        places = [] if self.episode is None else [f"episode {named(self.episode, self.name)}"]
         return ": ".join([*places, *([self.camera] if self.camera else []), self.text])
 
 
 def audit(
     dataset: Dataset, episodes: Sequence[DatasetEpisode], cameras: Sequence[str], watch: Watch = QUIET
 ) -> list[Doubt]:
-    """Return doubts about files and outcomes, and about the frames of at most MOST_DECODED episodes.
+    """Return doubts about files, their numbers and outcomes, and about the frames of at most MOST_DECODED episodes.
 
     Raises RewardError if a frame cannot be decoded.
     """
     doubts = []
     if unused := dataset.unused_files():
-        what = f"{len(unused)} files that no episode uses: {first_names(list(map(str, unused)))}"
+        what = f"{counted(len(unused), 'file')} that no episode uses: {first_names(list(map(str, unused)))}"
         doubts.append(Doubt(f"{what}; left from a recording that was written again?"))
     for name in _OUTCOMES:
         try:
@@ -54,7 +64,11 @@ def audit(
                 doubts.append(Doubt(str(error)))
             continue
         if missing := [each.index for each in episodes if outcomes.get(each.index) is None]:
-            doubts.append(Doubt(f"{name}: {len(missing)} episodes without an outcome: {listed(missing)}"))
+            doubts.append(Doubt(f"{name}: {counted(len(missing), 'episode')} without an outcome: {listed(missing)}"))
+    for episode in episodes:
+        for camera in cameras:
+            if text := dataset.doubt(episode, camera):
+                doubts.append(Doubt.of(text, episode, camera))
     chosen = _neighbours(len(episodes))
     watch.checking(len(chosen))
     last: dict[str, UInt8Array] = {}  # last frame by camera, of the episode before
@@ -64,7 +78,7 @@ def audit(
             last = {}
         for camera in cameras:
             frames = dataset.frames(episode, camera)
-            doubts += [Doubt(text, episode.index, camera) for text in _of_frames(frames, camera, last)]
+            doubts += [Doubt.of(text, episode, camera) for text in _of_frames(frames, camera, last)]
         watch.checked(episode)
     if len(chosen) < len(episodes):
         watch.note(f"audit: frames of {len(chosen)} of {len(episodes)} episodes; choose others with --episodes")

@@ -64,15 +64,16 @@ class EpisodeLabels:
     is_answered: npt.NDArray[np.bool_]
 
 
-def find_label_files(root: Path) -> list[Path]:
+def find_label_files(root: Path, folder: Path | None = None) -> list[Path]:
     """Find a dataset's label files, with the default name first.
 
     root: the dataset's folder, or HDF5 file
+    folder: of the label files; None: beside the dataset
 
     For labels in both formats, return only the progress file. Raises DatasetError for a folder with labels for several
     HDF5 files.
     """
-    folder = root.parent if root.is_file() else root
+    folder = folder or (root.parent if root.is_file() else root)
     progress = sorted(folder.glob(f"[!.]*{PROGRESS_ENDING}"))
     named = {reward_name(file) for file in progress}
     signals = [file for file in sorted((folder / SIGNALS_FOLDER).glob("[!.]*.parquet")) if file.stem not in named]
@@ -198,6 +199,12 @@ class LabelFile:
     path: Path
     provenance: Mapping[str, Any]
     digests: Mapping[int, str]
+
+    @property
+    def checkpoint(self) -> str:
+        """Where the checkpoint comes from, else its digest; empty: unknown."""
+        checkpoint = self.provenance.get("checkpoint") or {}
+        return str(checkpoint.get("source") or checkpoint.get("weights_digest") or "")
 
     @classmethod
     def read(cls, path: Path) -> LabelFile:

@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from rfm_client.options import counted
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset
 from rfm_labels.datasets.faults import DatasetError
 from rfm_labels.label_files import LabelFile
 from rfm_labels.metadata import PROGRESS, SCORES, blank_from_metadata, blank_lines, skipping_in
 from rfm_labels.options import DEFAULTS, QUIET, LabelOptions, Watch
-from rfm_labels.plan import Plan, checked_episodes, plan_labels
+from rfm_labels.plan import Plan, checked_episodes, part_key, plan_labels
 from rfm_labels.scorer import Scorer
 from rfm_labels.scoring import FailedEpisode, Run
 from rfm_labels.summary import Summary, summary_of
@@ -79,7 +80,7 @@ def planned(dataset: Dataset, scorer: Scorer, outputs: Outputs, watch: Watch = Q
                 option = "--alias" if file.path in outputs.progress[1:] else "--name"
                 problem = f"{error.problem}: choose another {option}, or --overwrite"
                 raise DatasetError(problem, error.where) from error
-            labels = f"its labels of {len(file.digests)} episodes are" if file.digests else "it is"
+            labels = f"its labels of {counted(len(file.digests), 'episode')} are" if file.digests else "it is"
             watch.note(f"--overwrite: {error}; {labels} replaced")
     checked_episodes(dataset, options, watch)  # after the cheap refusals
     return plan
@@ -107,7 +108,7 @@ def put_together(
     if len(plan.items) < num_episodes:
         others = "; LeRobot's reader gives frames of the others the weight 1.0" if outputs.progress else ""
         watch.note(f"{len(plan.items)} of the dataset's {num_episodes} episodes have labels{others}")
-    return replace(report, files=files, summary=summary_of(labels))
+    return replace(report, files=files, summary=summary_of(labels, plan.names))
 
 
 @dataclass(frozen=True)
@@ -142,7 +143,17 @@ class Outputs:
     @cached_property
     def parts(self) -> Parts:
         """The finished episodes. First access creates their folder."""
-        return Parts(self.options.parts or str(self.folder / f".{self.options.name}_parts"))
+        return Parts(self.options.parts or str(self.own_parts))
+
+    @property
+    def own_parts(self) -> Path:
+        """The folder of the parts, unless another place is named."""
+        return self.folder / f".{self.options.name}_parts"
+
+    def keeps(self, file: LabelFile) -> bool:
+        """True if the parts have all labels of a file, so that the same run writes it again without scoring."""
+        keys = self.parts.keys() if self.options.parts or self.own_parts.is_dir() else set()
+        return bool(file.digests) and {part_key(*each) for each in file.digests.items()} <= keys
 
     def make_folder(self) -> None:
         """Create the folder if it is missing. Raises DatasetError if it is not writable."""

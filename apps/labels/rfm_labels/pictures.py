@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from rfm_client.options import counted
 from rfm_client.plot import save
 from rfm_labels.evaluation import LabelComparison
 from rfm_labels.label_files import read_provenance
@@ -15,7 +16,7 @@ AXES_IN = 1.3  # height
 HEADLINE_IN = 0.5
 BINS = 20
 STYLE = "rfm_client.figure"  # the shared style file defines what each colour means
-SUCCESS_COLOUR, FAILURE_COLOUR = "C2", "C6"  # matplotlib's default colour shows progress
+SUCCESS_COLOUR, FAILURE_COLOUR = "C0", "C1"  # blue and orange, which colour-blind people tell apart
 
 
 def draw_evaluation(file: Path, comparison: LabelComparison, labels: Sequence[Path]) -> None:
@@ -50,7 +51,7 @@ def draw_evaluation(file: Path, comparison: LabelComparison, labels: Sequence[Pa
             ax.yaxis.get_major_locator().set_params(integer=True)
         axes[-1].set_xlabel("progress at the last frame")
         datasets = ", ".join(dict.fromkeys(dataset for dataset, _ in origins))
-        title = f"{datasets}: {len(comparison.episodes)} episodes"
+        title = f"{datasets}: {counted(len(comparison.episodes), 'episode')}"
         figure.suptitle(title, x=0.01, ha="left", fontsize=8)
         if known is not None:
             figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=2)

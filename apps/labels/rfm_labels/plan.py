@@ -22,7 +22,7 @@ from rfm_client.frames import (
     Sampling,
     resize_frames,
 )
-from rfm_client.options import InvalidValueError, first_names
+from rfm_client.options import InvalidValueError, counted, first_names
 from rfm_labels.advantage import RECAP
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.datasets.faults import FaultsError, listed, require
@@ -209,6 +209,11 @@ class Recipe:
         require(longest.name, len(fit) == len(episodes), f"at most {limit} frames, as the checkpoint takes", got)
 
 
+def part_key(number: int, digest: str) -> str:
+    """Return the name of an episode's part, without suffix."""
+    return f"episode-{number:06d}-{digest}"
+
+
 @dataclass(frozen=True)
 class Item:
     """One episode to label. digest: over everything that decides its labels."""
@@ -219,7 +224,7 @@ class Item:
     @property
     def key(self) -> str:
         """The part's name, without suffix."""
-        return f"episode-{self.episode.index:06d}-{self.digest}"
+        return part_key(self.episode.index, self.digest)
 
 
 @dataclass(frozen=True)
@@ -244,6 +249,11 @@ class Plan:
     def episodes(self) -> list[DatasetEpisode]:
         """The episodes to label."""
         return [item.episode for item in self.items]
+
+    @property
+    def names(self) -> dict[int, str]:
+        """The names of the episodes that have names of their own, by number."""
+        return {each.index: name for each in self.episodes if (name := each.own_name)}
 
     def digests(self) -> dict[str, str]:
         """Return item digests by episode number."""
@@ -361,7 +371,7 @@ def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: 
     several = sum(bool(episode.tasks) for episode in episodes)
     if several:
         how = "each stretch of frames with one task is scored by itself (--several-tasks first: all by the first task)"
-        watch.note(f"tasks: {several} episodes have several: {how}")
+        watch.note(f"tasks: several in {counted(several, 'episode')}: {how}")
         if "progress" in options.formats:
             own = "the scores are in the column progress"
             watch.note(f"progress_sparse: the sum of the gains in an episode's tasks, as LeRobot's RA-BC needs; {own}")
@@ -385,10 +395,10 @@ def _task_lines(dataset: Dataset, episodes: Sequence[DatasetEpisode]) -> list[st
     """Return a line about episodes that use the caller's task, and one about tasks that are not sentences."""
     given, lines = dataset.given_task, []
     if given.overrides:
-        lines.append(f"tasks: all {len(episodes)} episodes get --task")
+        lines.append(f"tasks: --task for all {counted(len(episodes), 'episode')}")
     elif given.text is not None:
         num_given = sum(any(task == given.text for task, _ in episode.stretches) for episode in episodes)
-        lines.append(f"tasks: {len(episodes) - num_given} episodes keep their own sentence, {num_given} get --task")
+        lines.append(f"tasks: their own for {counted(len(episodes) - num_given, 'episode')}, --task for {num_given}")
     known = dict.fromkeys(task for episode in episodes for task, _ in episode.stretches)
     words = [task for task in known if task.isascii() and len(task.split()) == 1]  # such as ``pick_place_cup``
     if words:

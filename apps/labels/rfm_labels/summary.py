@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,8 @@ import numpy.typing as npt
 
 from rfm_client import Float32Array
 from rfm_client.episodes import SuccessRule
-from rfm_labels.datasets.faults import require
-from rfm_labels.label_files import read_label_table
+from rfm_labels.datasets.faults import named, require
+from rfm_labels.label_files import read_label_table, read_names
 from rfm_labels.metadata import PROGRESS, SUCCESS
 
 BACKWARDS_BY = 0.01  # kappa in reward-aligned behaviour cloning; a smaller fall is noise
@@ -33,6 +34,7 @@ class Summary:
     backwards: float64 [E], share of steps on which progress falls by more than 0.01
     disagreement: float64 [E], range of progress over cameras, averaged over frames; None: no separate camera scores
     num_frames: total over all episodes
+    names: by number, of episodes that have names of their own
     """
 
     episodes: npt.NDArray[np.int64]
@@ -43,6 +45,7 @@ class Summary:
     backwards: npt.NDArray[np.float64]
     disagreement: npt.NDArray[np.float64] | None
     num_frames: int
+    names: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def outcomes(self) -> dict[str, npt.NDArray[np.bool_]]:
@@ -63,7 +66,8 @@ class Summary:
         for outcome, has_it in self.outcomes.items():
             numbers = self.episodes[has_it].tolist()
             more = " ..." if len(numbers) > _MOST_LISTED else ""
-            by_outcome[outcome] = f"{len(numbers)}: {', '.join(map(str, numbers[:_MOST_LISTED]))}{more}"
+            listed = ", ".join(named(number, self.names.get(number)) for number in numbers[:_MOST_LISTED])
+            by_outcome[outcome] = f"{len(numbers)}: {listed}{more}"
         return [
             ("episodes", str(len(self.episodes))),
             ("frames", str(self.num_frames)),
@@ -83,11 +87,11 @@ def summarise(file: Path) -> Summary:
     """Summarise a label file. Raises DatasetError if it is not one."""
     table = read_label_table(file)
     require(file, len(table) > 0, "labels", "none")
-    return summary_of(table)
+    return summary_of(table, read_names(file))
 
 
-def summary_of(labels: Any) -> Summary:
-    """Summarise labels, a pyarrow Table with the parts' column names."""
+def summary_of(labels: Any, names: Mapping[int, str]) -> Summary:
+    """Summarise labels, a pyarrow Table with the parts' column names. names: as in ``Summary``"""
     episodes = labels["episode_index"].to_numpy()
     starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1)).tolist()
     numbers, final, best, last, voted, backwards, apart = [], [], [], [], [], [], []
@@ -116,4 +120,5 @@ def summary_of(labels: Any) -> Summary:
         backwards=np.array(backwards, np.float64),
         disagreement=np.array(apart, np.float64) if apart else None,
         num_frames=len(labels),
+        names=names,
     )

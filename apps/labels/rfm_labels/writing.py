@@ -90,9 +90,13 @@ class Parts:
 
     def finished(self, items: Sequence[Item]) -> set[str]:
         """Return the keys of items whose parts exist."""
+        return self.keys() & {item.key for item in items}
+
+    def keys(self) -> set[str]:
+        """Return the keys of all parts that exist."""
         self._fs.invalidate_cache()
-        names = {path.rpartition("/")[2] for path in self._fs.ls(self._root, detail=False)}
-        return {item.key for item in items if item.key + _SUFFIX in names}
+        names = (path.rpartition("/")[2] for path in self._fs.ls(self._root, detail=False))
+        return {name.removesuffix(_SUFFIX) for name in names if name.endswith(_SUFFIX)}
 
     def has(self, item: Item) -> bool:
         """True if the item's part exists."""
@@ -202,7 +206,7 @@ def _temporary(target: Path) -> Iterator[Path]:
     The name is fixed, so that a repeated run overwrites what a killed run left. It is a random one while another run
     writes the same target, or if the file system has no locks.
     """
-    file = target.with_name(f".{target.name}.{os.getuid()}.tmp")  # this user can overwrite it
+    file = _temporary_name(target)
     with ExitStack() as files:
         opened = files.enter_context(file.open("ab"))
         if not _locked(file, opened):
@@ -215,6 +219,10 @@ def _temporary(target: Path) -> Iterator[Path]:
                 file.unlink()
 
 
+def _temporary_name(target: Path) -> Path:
+    return target.with_name(f".{target.name}.{os.getuid()}.tmp")  # this user can overwrite it
+
+
 def _locked(file: Path, opened: IO[bytes]) -> bool:
     """Lock the open file until it is closed, even by a kill. Return False if another run has it or has moved it."""
     try:
@@ -225,6 +233,17 @@ def _locked(file: Path, opened: IO[bytes]) -> bool:
         file.unlink(missing_ok=True)
         return False
     return _is_at(file, opened)
+
+
+def remove_files(files: Sequence[Path]) -> None:
+    """Delete files, unless a run is writing one of them. Raises DatasetError, OSError."""
+    with ExitStack() as held:
+        for file in files:
+            temporary = held.enter_context(_temporary(file))
+            got = "one, or a file system without locks: wait, or delete the file yourself"
+            require(file, temporary == _temporary_name(file), "no run that writes it", got)
+        for file in files:
+            file.unlink()
 
 
 def _is_at(file: Path, opened: IO[bytes]) -> bool:
@@ -374,7 +393,7 @@ def write_labels(labels: Any, plan: Plan, progress: Sequence[Path], signals: Seq
     forms = [(path, _progress_form(plan, columns)) for path in progress]
     forms += [(path, _signals_form(plan, columns, name)) for path in signals]
     shared = {EPISODES_KEY: canonical_json(plan.digests()), **(labels.schema.metadata or {})}
-    if names := {str(each.index): each.name for each in plan.episodes if each.name != f"episode {each.index}"}:
+    if names := plan.names:
         shared[NAMES_KEY] = canonical_json(names)
     labels = _with_totals(labels, plan)
     for path, _ in forms:

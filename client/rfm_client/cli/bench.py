@@ -19,6 +19,7 @@ from rfm_client.cli.command import usage_errors
 from rfm_client.cli.options import SYNTHETIC_TASK, asked_model
 from rfm_client.cli.show import number, table
 from rfm_client.client import RewardClient
+from rfm_client.contract.checks import counted
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.samples import ProgressSample, random_trajectory
 from rfm_client.contract.settings import ConfigError, Settings, setting
@@ -90,7 +91,7 @@ class Measured:
         share, failed = f"{self.in_time:.2%}", sum(self.failures.values())
         columns = ("steps", "answered per s", "p50 ms", "p99 ms", "in time", "failed")
         row = [str(self.steps), *(number(each, 1) for each in (self.steps_per_s, self.p50_ms, self.p99_ms))]
-        title = f"{load.robots} robot{'s' * (load.robots > 1)} at {load.hz:g} Hz, {self.asked}"
+        title = f"{counted(load.robots, 'robot')} at {load.hz:g} Hz, {self.asked}"
         lines = [table(title, columns, [[*row, share, str(failed)]])]
         lines += [f"{count} failed: {reason}" for reason, count in self.failures.items()]
         verdict = "held" if self.is_held else f"not held (expected at least {ENOUGH:.0%} in time, and none failed)"

@@ -39,12 +39,7 @@ from rfm_client.cli.options import (
     VideoOptions,
     WaitOptions,
 )
-from rfm_client.cli.show import (
-    Table,
-    in_place_of_progress,
-    scores_table,
-    status_tables,
-)
+from rfm_client.cli.show import scores_table, status_tables, wrapped
 from rfm_client.contract.errors import DeadlineExceededError, RewardError
 from rfm_client.contract.results import FRAME_SCORES
 from rfm_client.plot import save
@@ -97,8 +92,6 @@ def score(
     """
     output.begin(len(videos))
     video.begin(videos)
-    columns, widths = zip(*scoring.COLUMNS, strict=True)
-    rows = Table(columns, [videos, *(["-" * width] for width in widths[1:])])
     shown: list[scoring.Scored] = []
 
     def tell(outcome: scoring.Outcome) -> None:
@@ -110,6 +103,7 @@ def score(
         for note in filter(None, (FRAME_SCORES[name].mark_note(each) for name, each in result.arrays.items())):
             report(f"note: {outcome.name}: {note}")
         if output.prints_tables:
+            rows = (shown or [outcome])[0].table(videos)
             print(*rows.head * (not shown), rows.row(outcome.row), sep="\n", flush=True)
         shown.append(outcome)
 
@@ -117,15 +111,17 @@ def score(
         video.check_read(client)
         outcomes = scoring.SourceScorer(client, video, prefix, recording).score_all(videos, tell)
     if output.prints_tables and shown:
-        print("\n  " + " ".join(filter(None, (prefix.rule, in_place_of_progress(each.result for each in shown)))))
+        print("\n" + wrapped(prefix.rule, "  ", "  "))
     output.write_json(documents.score_document(server, video, prefix, outcomes))
+    caption = output.caption
+    if caption is None:
+        caption = scoring.heading(video.task, [outcome.checkpoint for outcome in shown])
     if output.plot is not None and shown:
-        save(scoring.figure(shown, video.task), output.plot)
+        save(scoring.figure(shown, caption, output.size), output.plot)
     if output.strips is not None and shown:
         from rfm_client.cli.pictures import plot
 
-        title = scoring.heading(video.task, [outcome.checkpoint for outcome in shown])
-        plot(output.strips, [outcome.panel for outcome in shown], title)
+        plot(output.strips, [outcome.panel for outcome in shown], caption, size=output.size)
     raise typer.Exit(scoring.exit_code_of_outcomes(outcomes))
 
 

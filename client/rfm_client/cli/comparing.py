@@ -16,7 +16,7 @@ from typing import cast
 
 from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.scoring import Source
-from rfm_client.cli.show import at_end, number, table
+from rfm_client.cli.show import at_end, number, table, title_at_end
 from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError
 from rfm_client.contract.results import PreferenceResult, ProgressResult
@@ -75,7 +75,7 @@ class Comparison:
 
     def tables(self) -> list[str]:
         """Return a table of sources, best first, a table of pairs, and without a ranking a legend."""
-        columns = ("video", "rank", "P(wins)", "final progress", "final success", "frames")
+        columns = ("video", "rank", "P(wins)", title_at_end(self.scores[0]), "final success", "frames")
         pairs = ("first", "second", "P(first wins)", "order swapped", "mean", "orders")
         return [
             table("", columns, [self._row(index) for index in self._shown]),

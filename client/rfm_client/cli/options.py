@@ -27,7 +27,7 @@ from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
 from rfm_client.contract.wire import DEFAULT_MODEL
 from rfm_client.frames.orientation import ChannelOrder, Orientation
 from rfm_client.frames.sampling import RULES, Rule, Sampling
-from rfm_client.plot import MAX_CURVES
+from rfm_client.plot import MAX_CURVES, Size
 from rfm_client.transport.connection import Credentials
 
 SampleType: TypeAlias = Literal["progress", "preference", "similarity"]
@@ -288,6 +288,10 @@ class OutputOptions(JsonOutput):
     )
     strips: Path | None = setting(
         None, "Draw frames of each video above its scores: .png, .pdf or .svg.", metavar="FILE"
+    )
+    size: Size = setting("paper", "Shape of --plot and --strips: paper, as high as needed; slide, 16:9; square, 1:1.")
+    caption: str | None = setting(
+        None, "Text above --plot and --strips; empty: none. Default: the task and the checkpoint.", metavar="TEXT"
     )
     rrd: Path | None = setting(
         None, "Record frames and scores on one timeline for Rerun's viewer: .rrd.", metavar="FILE"

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from rfm_client.cli.command import ExitCode, exit_code, exit_code_of, missing_package, user_message
 from rfm_client.cli.options import PrefixOptions, VideoOptions
 from rfm_client.cli.pictures import Panel
-from rfm_client.cli.show import at_end, number
+from rfm_client.cli.show import Table, at_end, number, title_at_end
 from rfm_client.client import RewardClient
 from rfm_client.contract.checks import is_blank
 from rfm_client.contract.errors import (
@@ -30,7 +30,7 @@ from rfm_client.contract.errors import (
 from rfm_client.contract.results import FrameScores, ProgressResult
 from rfm_client.contract.samples import Trajectory
 from rfm_client.frames.sampling import Sampling
-from rfm_client.plot import plot_scores
+from rfm_client.plot import Size, plot_scores
 from rfm_client.recording import Recording
 from rfm_client.scoring.samples import CallOptions
 
@@ -40,10 +40,6 @@ if TYPE_CHECKING:
 WORKERS = 8  # videos in memory at a time
 PROBE_S = 2.0  # timeout for checking that a server is alive
 NOT_ASKED = "not asked, since no server answers any more"
-COLUMNS = (  # headers for ``Scored.row``, and their widths
-    *(("video", 0), ("final progress", 8), ("final success", 7), ("frames", 13)),
-    *(("last at s", 7), ("took s", 6), ("version", 7)),
-)
 
 Times = npt.NDArray[np.float64]
 
@@ -94,9 +90,14 @@ class Scored:
     panel: Panel
     took_s: float
 
+    def table(self, names: Sequence[str]) -> Table:
+        """Return a table for this source and others with these names."""
+        columns = ("video", title_at_end(self.result), "final success", "frames", "last at s", "took s", "version")
+        return Table(columns, [names, *(["-" * width] for width in (8, 7, 13, 7, 6, 7))])
+
     @property
     def row(self) -> tuple[str, ...]:
-        """The source's cells under ``COLUMNS``."""
+        """The source's cells in ``table``."""
         count, success = len(self.result.progress), number(self.result.success[-1])
         frames = str(count) if count == self.num_frames else f"{count} of {self.num_frames}"
         seconds = "-" if self.times_s is None else f"{self.times_s[-1]:.1f}"
@@ -218,7 +219,9 @@ def _evaluate(
 def checkpoint_of(client: RewardClient, trajectory: Trajectory) -> str:
     """Return where the checkpoint that scores the trajectory comes from, else the model's name."""
     info = client.model_info(frames=trajectory.frames is not None)
-    return info.source or info.name
+    source = info.source or info.name
+    run = source.removesuffix("/checkpoint")  # a name, unless the folder is a version
+    return source if run.isdecimal() else run
 
 
 def heading(task: str, checkpoints: Iterable[str]) -> str:
@@ -226,11 +229,12 @@ def heading(task: str, checkpoints: Iterable[str]) -> str:
     return "\n".join([*[f'"{task}"'] * (not is_blank(task)), ", ".join(dict.fromkeys(checkpoints))])
 
 
-def figure(scored: Sequence[Scored], task: str) -> Figure:
+def figure(scored: Sequence[Scored], title: str, size: Size) -> Figure:
     """Return one figure with these sources' curves. Raises ImportError without matplotlib."""
     return plot_scores(
         [each.result for each in scored],
         unique_stems([each.name for each in scored]),
-        title=heading(task, [each.checkpoint for each in scored]),
+        title=title,
         times_s=[each.times_s for each in scored],
+        size=size,
     )

@@ -14,6 +14,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from rfm_client.cli.options import DEFAULT_URL
+from rfm_client.contract.checks import counted
 from rfm_client.contract.results import (
     FRAME_SCORES,
     FrameScores,
@@ -25,9 +26,6 @@ from rfm_client.contract.results import (
 from rfm_client.contract.wire import DEFAULT_MODEL
 from rfm_client.transport.status import Device, ServerStatus
 
-FILE_WIDTH = 200
-SHORTEST_NAME = 12
-CUT = "..."  # replaces the left-out part in a name
 GAP = "  "  # between columns
 
 _GIB = 2**30
@@ -39,68 +37,70 @@ def number(value: float | None, digits: int = 4) -> str:
 
 
 def at_end(scores: FrameScores) -> str:
-    """Return progress at the last frame as text, or what the model predicts instead, with the unit."""
-    last, unit = float(scores.arrays[scores.leading][-1]), FRAME_SCORES[scores.leading].unit
-    return f"{number(last, 2)} {unit}" if unit else number(last)
+    """Return progress at the last frame as text, or what the model predicts instead."""
+    return number(float(scores.arrays[scores.leading][-1]), 2 if FRAME_SCORES[scores.leading].unit else 4)
 
 
-def in_place_of_progress(results: Iterable[FrameScores]) -> str:
-    """Return a sentence about numbers that replace progress; empty: none do."""
-    instead = [FRAME_SCORES[name] for name in sorted({result.leading for result in results} - {"progress"})]
-    return " ".join(f"In {score.unit}, in place of progress: {score.meaning.lower()}." for score in instead)
+def title_at_end(scores: FrameScores) -> str:
+    """Return the header for ``at_end``: ``final progress``, or ``final remaining (s)``."""
+    return f"final {FRAME_SCORES[scores.leading].title(scores.leading)}"
 
 
-def shortened(name: str, width: int) -> str:
-    """Cut the middle out of a name longer than ``width`` characters; a file's own name stays if it fits."""
-    if len(name) <= width or width <= len(CUT):
-        return name[:width]
-    kept = width - len(CUT)
-    file_name = len(name) - max(name.rfind("/"), 0)  # with the slash before it
-    end = file_name if kept // 2 <= file_name <= kept else kept - kept // 2
-    return f"{name[: kept - end]}{CUT}{name[len(name) - end :]}"
+def _room() -> int:
+    """The columns of the terminal, or COLUMNS; a file or pipe has room for any line."""
+    return shutil.get_terminal_size((sys.maxsize, 0)).columns
+
+
+def wrapped(text: str, first: str = "", others: str = "") -> str:
+    """Return the text in lines that fit the terminal, without breaking words. first, others: begin the lines"""
+    lines = textwrap.TextWrapper(
+        _room(), initial_indent=first, subsequent_indent=others, break_long_words=False, break_on_hyphens=False
+    )
+    return lines.fill(text)
 
 
 class Table:
-    """A plain table. Headers wrap to fit their columns.
+    """A plain table. Headers wrap to fit their columns. No cell is cut.
 
     columns: headers
     cells: all cells in each column, or stand-ins of the same width
-    names: how many leading columns hold names and paths, which are shortened to fit COLUMNS, or else the terminal; a
-        file or pipe gets FILE_WIDTH
+    names: how many leading columns hold names and paths, which stand on lines of their own, above their row's other
+        cells, if the table does not fit the terminal
     """
 
     def __init__(self, columns: Sequence[str], cells: Sequence[Iterable[str]], *, names: int = 1) -> None:
-        widths = [max(map(len, (*head.split(), *column, ""))) for head, column in zip(columns, cells, strict=True)]
-        width = shutil.get_terminal_size((FILE_WIDTH, 0)).columns
-        room = width - sum(widths[names:]) - len(GAP) * len(columns)
-        most = max(SHORTEST_NAME, room // names)
-        self._widths = [*(min(each, most) for each in widths[:names]), *widths[names:]]
-        self._names = names
-        self._columns = columns
-        self.fits = sum(self._widths) + len(GAP) * len(columns) <= width
+        self._columns, self._above = columns, 0
+        headed = zip(columns, cells, strict=True)
+        self._widths = [max(map(len, (*head.split(), *column, ""))) for head, column in headed]
+        if not self.fits:
+            self._above, self._widths = names, self._widths[names:]
+
+    @property
+    def fits(self) -> bool:
+        """True if the columns fit the terminal."""
+        return sum(self._widths) + len(GAP) * (len(self._widths) + bool(self._above)) <= _room()
 
     @property
     def head(self) -> list[str]:
         """The lines above the rows."""
-        words = (
-            textwrap.wrap(head, max(width, 1))[::-1] for head, width in zip(self._columns, self._widths, strict=True)
-        )
-        lines = [*itertools.zip_longest(*words, fillvalue="")][::-1]
-        return [self._line(each) for each in (*lines, ["-" * width for width in self._widths])]
+        heads = zip(self._columns[self._above :], self._widths, strict=True)
+        words = (textwrap.wrap(head, max(width, 1))[::-1] for head, width in heads)
+        first, *others = [*itertools.zip_longest(*words, fillvalue="")][::-1]
+        rule = self._line(["-" * width for width in self._widths])
+        return [self.row([*self._columns[: self._above], *first]), *map(self._line, others), rule]
 
     def row(self, cells: Sequence[str]) -> str:
         """Return a table row with headers or cells."""
-        names = (shortened(name, width) for name, width in zip(cells, self._widths[: self._names], strict=False))
-        return self._line([*names, *cells[self._names :]])
+        return "\n".join([*(f"{GAP}{name}" for name in cells[: self._above]), self._line(cells[self._above :])])
 
     def _line(self, cells: Sequence[str]) -> str:
         padded = (cell.ljust(width) for cell, width in zip(cells, self._widths, strict=True))
-        return f"{GAP}{GAP.join(padded)}".rstrip()
+        return f"{GAP * (2 if self._above else 1)}{GAP.join(padded)}".rstrip()
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, names: int = 1) -> str:
     """Return a ``Table`` below a title, if given. Columns that do not fit follow below, after the names."""
-    lines, begin = [title] * bool(title), names
+    lines, begin = [wrapped(title)] * bool(title), names
     while begin < len(columns):
         for end in range(len(columns), begin, -1):
             shown = [*range(names), *range(begin, end)]
@@ -113,9 +113,16 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, 
     return "\n".join(lines)
 
 
-def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, names: int = 1) -> None:
-    """Print the table that ``table`` returns."""
-    print(table(title, columns, rows, names=names))
+def print_facts(rows: Sequence[tuple[str, str]]) -> None:
+    """Print names and values, one pair a line; long values wrap."""
+    width = max(len(name) for name, _ in rows)
+    for name, value in rows:
+        print(wrapped(value, f"{GAP}{name:{width}}{GAP}", " " * (width + 2 * len(GAP))))
+
+
+def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], legend: str = "") -> None:
+    """Print the table that ``table`` returns, and a legend."""
+    print(table(title, columns, rows) + f"\n{wrapped(legend)}" * bool(legend))
 
 
 def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> str:
@@ -123,7 +130,7 @@ def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> str:
     shown = []
     for name, result in rows:
         if isinstance(result, ProgressResult):
-            answer = f"{len(result.progress)} frames"
+            answer = counted(len(result.progress), "frame")
         elif isinstance(result, PreferenceResult):
             answer = f"P(first) = {result.preference:.4f}"
         else:
@@ -132,7 +139,7 @@ def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> str:
             row = ": ".join(filter(None, (name, role)))
             shown.append((row, answer, at_end(frames), number(frames.success[-1])))
             answer = ""
-    return table(title, ("sample", "answer", "progress at the end", "success at the end"), shown)
+    return table(title, ("sample", "answer", title_at_end(frames), "final success"), shown)
 
 
 def status_tables(status: ServerStatus) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Validate callers' values, numbers, tasks and files; shorten name lists for messages."""
+"""Validate callers' values, numbers, tasks and files; words for messages."""
 
 from __future__ import annotations
 
@@ -27,6 +27,12 @@ def first_names(names: Collection[object], most: int = 5) -> str:
     """Return the first names and how many more there are."""
     more = len(names) - most
     return ", ".join(map(str, list(names)[:most])) + (f" and {more} more" if more > 0 else "")
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: ``1 video``, ``2 videos``."""
+    ending = "" if number == 1 else "es" if noun.endswith("s") else "s"
+    return f"{number} {noun}{ending}"
 
 
 def git_lfs_pointer(content: Path | bytes) -> str:

@@ -41,6 +41,8 @@ NO_VERSIONS = "no available versions"  # the model failed, or is reloading
 LOST_REGION = "Unable to find shared memory region"  # the server was restarted
 REGION_IN_USE = "it is currently in use"  # while unmapping a region
 RESTRICTED = "is restricted, expecting header"  # the API needs a key
+METADATA_PREFIX = "triton-grpc-protocol-"  # over gRPC, Triton puts it before the name of the key's header
+AUTHORIZATION = "authorization"
 
 _NO_CONNECTION = re.compile(  # gRPC's own messages: nothing was sent
     "failed to connect|connections to all backends failing|errors resolving|resolution failed"
@@ -167,6 +169,11 @@ def error_of(status: str, message: str, bad_request: BadRequest) -> errors.Rewar
 def is_denied(status: str, message: str) -> bool:
     """True if one side refused the other: a missing or wrong key, or an untrusted certificate."""
     return status in DENIED or (status == "StatusCode.UNAVAILABLE" and _NO_TRUST.search(message) is not None)
+
+
+def bearer_headers(key: str) -> dict[str, str]:
+    """Return the headers with an API key: the usual one, and the metadata that Triton expects over gRPC."""
+    return dict.fromkeys((AUTHORIZATION, f"{METADATA_PREFIX}{AUTHORIZATION}"), f"Bearer {key}")
 
 
 def denied(url: str, status: str, message: str) -> errors.AccessDeniedError:

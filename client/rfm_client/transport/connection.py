@@ -25,6 +25,7 @@ from typing import Any
 
 from rfm_client.contract.addresses import check_authorities, host_of, is_loopback, load_certificate
 from rfm_client.contract.settings import ConfigError
+from rfm_client.contract.triton import AUTHORIZATION, bearer_headers
 
 PING_MS = 330_000
 UNACKNOWLEDGED_MS = 10_000
@@ -50,7 +51,6 @@ def grpc_options(address: str) -> list[tuple[str, int | str]]:
 
 
 SECURE_SCHEMES = ("grpcs", "https")
-AUTHORIZATION = "authorization"
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")
 _VALUE = re.compile("[!-~]([ -~]*[!-~])?")  # visible ASCII, with spaces inside
@@ -63,7 +63,7 @@ class Credentials:
     ca_file: CA certificates (PEM) that may vouch for the server; None: the system's
     client_certificate, client_key: files (PEM) that identify this client (mutual TLS); both or neither
     headers: sent with every request, over gRPC as metadata
-    api_key: sent with every request as ``Authorization: Bearer KEY``
+    api_key: sent with every request as ``Authorization: Bearer KEY``, and as the metadata that Triton asks for
     """
 
     ca_file: str | Path | None = None
@@ -78,7 +78,7 @@ class Credentials:
             if not _NAME.fullmatch(name) or name.endswith("-bin"):  # binary metadata in gRPC
                 raise ConfigError.at("headers", "letters, digits and any of ._- as a name", f"{name!r:.100}")
             if not _VALUE.fullmatch(value):
-                where = "api_key" if name == AUTHORIZATION and self.api_key is not None else name
+                where = "api_key" if name.endswith(AUTHORIZATION) and self.api_key is not None else name
                 raise ConfigError.at(where, "visible ASCII characters", "others or none")
         if self.uses_tls:
             self.ssl_context  # noqa: B018  # reports an unreadable file now, not at first use
@@ -97,7 +97,7 @@ class Credentials:
     def shown(self) -> dict[str, str]:
         """All headers, with names in lower case, as gRPC requires."""
         given = {name.lower(): value for name, value in self.headers.items()}
-        return given if self.api_key is None else {**given, AUTHORIZATION: f"Bearer {self.api_key}"}
+        return given if self.api_key is None else {**given, **bearer_headers(self.api_key)}
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "ssl_context"}  # which cannot be pickled

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rfm_client.command_line import JsonOutput, number, print_table, with_options
-from rfm_client.options import setting
+from rfm_client.options import counted, setting
 
 if TYPE_CHECKING:
     from rfm_labels import LabelComparison
@@ -72,7 +72,6 @@ def evaluate(
     comparison = evaluate_labels(files, None if outcome is None else read_outcomes(outcome, dataset, names))
     if output.prints_tables:
         _print_tables(comparison)
-        print(LEGEND.format("successes" if comparison.is_success is not None else "all episodes"))
     output.write_json(document(comparison))
     if output.plot is not None:
         from rfm_labels.pictures import draw_evaluation
@@ -81,29 +80,29 @@ def evaluate(
 
 
 def _print_tables(comparison: LabelComparison) -> None:
-    """Print a row for each label file."""
+    """Print a row for each label file, and a legend."""
     known, rows = comparison.is_success, []
     columns = ["labels", "VOC rho", "VOC tau", "no VOC", "final", "falls"]
     if known is not None:
         columns[5:5] = ["of successes", "of failures", "AUROC success", "AUROC progress", "threshold", "accuracy"]
     for each in comparison.evaluations:
-        cells = [each.name, number(each.spearman, 3), number(each.kendall, 3), str(each.num_constant)]
-        cells.append(number(each.final, 3))
+        cells = [each.name, number(each.spearman), number(each.kendall), str(each.num_constant)]
+        cells.append(number(each.final))
         if known is not None:
             success, progress = each.by_success, each.by_progress
-            cells += [number(each.final_of_successes, 3), number(each.final_of_failures, 3)]
-            cells += [number(ranking.auroc if ranking else None, 3) for ranking in (success, progress)]
-            cells.append(number(success.threshold if success else None, 3))
-            cells.append(number(success.balanced_accuracy if success else None, 3))
+            cells += [number(each.final_of_successes), number(each.final_of_failures)]
+            cells += [number(ranking.auroc if ranking else None) for ranking in (success, progress)]
+            cells.append(number(success.threshold if success else None))
+            cells.append(number(success.balanced_accuracy if success else None))
         rows.append([*cells, f"{each.backwards:.1%}"])
-    counts = f"{len(comparison.episodes)} episodes"
+    counts = counted(len(comparison.episodes), "episode")
     if known is not None:
-        counts += f": {int(known.sum())} successes, {int((~known).sum())} failures"
+        counts += f": {counted(int(known.sum()), 'success')}, {counted(int((~known).sum()), 'failure')}"
     if comparison.num_left_out:
         counts += f"; {comparison.num_left_out} left out, which not all files have"
     if comparison.num_without_outcome:
         counts += f"; {comparison.num_without_outcome} left out, whose outcome is unknown"
-    print_table(counts, columns, rows)
+    print_table(counts, columns, rows, LEGEND.format("all episodes" if known is None else "successes"))
 
 
 def document(comparison: LabelComparison) -> dict[str, Any]:

@@ -13,16 +13,16 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias, get_args
 import typer
 
 from rfm_client import RewardError
-from rfm_client.command_line import ExitCode, JsonOutput, ServerOptions, print_table, report, with_options
+from rfm_client.command_line import ExitCode, JsonOutput, ServerOptions, print_facts, print_table, report, with_options
 from rfm_client.frames import ChannelOrder, Orientation
-from rfm_client.options import ConfigError, Settings, setting
+from rfm_client.options import ConfigError, Settings, counted, setting
 from rfm_labels.audit import audit
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, SeveralTasks, parsed_by_camera
 from rfm_labels.datasets.faults import FaultsError, UnusedTaskError, listed, require
 from rfm_labels.datasets.hdf5 import label_prefix
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
 from rfm_labels.datasets.opening import hdf5_files, open_dataset
-from rfm_labels.label_files import read_blank
+from rfm_labels.label_files import LabelFile, find_label_files, read_blank, reward_name
 from rfm_labels.labelling import Outputs, Report, planned
 from rfm_labels.labelling import label as label_dataset
 from rfm_labels.metadata import blank_lines
@@ -31,6 +31,7 @@ from rfm_labels.plan import checked_episodes
 from rfm_labels.ray_engine import Connect, label_with_ray
 from rfm_labels.scorer import ClientScorer, Scorer
 from rfm_labels.summary import summarise
+from rfm_labels.writing import remove_files
 
 ASK_BYTES = 10e9  # downloads above this need a confirmation
 SPEED_OVER_S = 600.0  # an episode may take minutes
@@ -88,15 +89,13 @@ class ProgressBar(Watch):
 
     def downloading(self, num_files: int, num_bytes: int) -> None:
         """Write how much is downloaded. Raises ConfigError, or typer.Abort after a "no", for a large download."""
-        size = f"{num_bytes / 1e9:.2f} GB in {num_files} files"
+        size = f"{num_bytes / 1e9:.2f} GB in {counted(num_files, 'file')}"
         self.note(f"downloading {size}, all that the chosen episodes and cameras need")
         if num_bytes <= ASK_BYTES or self._accepts:
             return
-        if not sys.stdin.isatty():
-            remedy = "choose fewer episodes (--episodes, --limit) or cameras (--cameras)"
-            raise ConfigError.at("yes", f"--yes for more than {ASK_BYTES / 1e9:g} GB", f"none for {size}", remedy)
         self._bar.stop()
-        typer.confirm(f"Download {size}?", abort=True)
+        remedy = "choose fewer episodes (--episodes, --limit) or cameras (--cameras)"
+        _confirm(f"Download {size}?", f"--yes for more than {ASK_BYTES / 1e9:g} GB", f"none for {size}", remedy)
         self._bar.start()
 
     def checking(self, num_episodes: int) -> None:
@@ -132,6 +131,13 @@ class ProgressBar(Watch):
     def _advance(self, by: int) -> None:
         for task in self._bar.task_ids:
             self._bar.advance(task, by)
+
+
+def _confirm(question: str, expected: str, got: str, remedy: str = "") -> None:
+    """Ask in a terminal. Raises typer.Abort after a "no", ConfigError without a terminal."""
+    if not sys.stdin.isatty():
+        raise ConfigError.at("yes", expected, got, remedy)
+    typer.confirm(question, abort=True)
 
 
 @dataclass(frozen=True)
@@ -203,10 +209,20 @@ class RunOptions(JsonOutput):
     )
     json: str | None = setting(None, "With --dry-run: write it as JSON to FILE; - prints it.", metavar="FILE|-")
     report: bool = setting(False, "Only show the summary of labels that are there.")
-    yes: bool = setting(False, f"Download more than {ASK_BYTES / 1e9:g} GB from the Hub without a question.")
+    list_labels: bool = setting(False, "Only list the labels that are there.", flag="--list")
+    remove: str | None = setting(
+        None, "Only delete the label files of this name. Finished episodes stay (--parts).", metavar="NAME"
+    )
+    yes: bool = setting(
+        False,
+        f"Do not ask before a download above {ASK_BYTES / 1e9:g} GB, or before --remove if the parts are gone.",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        chosen = [name for name in ("dry_run", "report", "list_labels", "remove") if getattr(self, name)]
+        if len(chosen) > 1:
+            raise ConfigError.of_two(chosen[0], "excludes", chosen[1])
         if self.json is not None and not self.dry_run:
             raise ConfigError.of_two("json", "needs", "dry_run")
 
@@ -260,13 +276,16 @@ class LabelCommand:
         """Run as the options say. Raises RewardError, OSError and ImportError."""
         if not (self.texts.reader or self.texts.videos) and (files := hdf5_files(self.source)):
             return self._run_each(files)
-        if self.options.report:
-            self._report()
-            return ExitCode.OK
-        if self.options.dry_run:
-            self._try()
-            return ExitCode.OK
+        for name, command in self._instead.items():
+            if getattr(self.options, name):
+                command()
+                return ExitCode.OK
         return self._tell(self._label())
+
+    @property
+    def _instead(self) -> dict[str, Callable[[], None]]:
+        """What to do instead of labelling, by option."""
+        return {"report": self._report, "dry_run": self._try, "list_labels": self._list, "remove": self._remove}
 
     def _run_each(self, files: Sequence[Path]) -> ExitCode:
         """Run for each HDF5 file in a folder, once all can be opened. Raises DatasetError if one cannot."""
@@ -280,7 +299,8 @@ class LabelCommand:
         require("output", has_room, "a folder for files whose names differ", got)
         commands = [replace(self, source=str(file)) for file in files]
         codes = []
-        for command in commands if self.options.report else self._checked(commands):
+        reads_frames = not (self.options.report or self.options.list_labels or self.options.remove)
+        for command in self._checked(commands) if reads_frames else commands:
             self.say(f"{command.source}")
             codes.append(command.run())
         return next((code for code in codes if code is not ExitCode.OK), ExitCode.OK)
@@ -338,7 +358,7 @@ class LabelCommand:
         self.options.write_json(document | {"doubts": [asdict(doubt) for doubt in doubts]})
         if not self.options.prints_tables:
             return
-        decoded = f"of {len(cameras)} cameras: {plan.num_frames * len(cameras)} to be decoded"
+        decoded = f"of {counted(len(cameras), 'camera')}: {plan.num_frames * len(cameras)} to be decoded"
         rows = [
             ("dataset", f"{dataset.kind}: {source}"),
             ("episodes", str(len(plan.items))),
@@ -346,13 +366,13 @@ class LabelCommand:
             (f"tasks: {len(tasks)}", "; ".join(tasks[:5]) + (" ..." if len(tasks) > 5 else "")),
             ("doubts", "none" if not doubts else str(len(doubts))),
         ]
-        _print(rows)
+        print_facts(rows)
         for doubt in doubts:
             typer.echo(f"doubt: {doubt}")
 
     def _tell(self, report: Report) -> ExitCode:
         if report.failures:
-            failed = f"{len(report.failures)} episodes failed"
+            failed = f"{counted(len(report.failures), 'episode')} failed"
             self.say(f"{failed}, so no file was written; the others are kept in {report.parts}")
             gone = {failure.episode.index for failure in report.failures}
             others = [item.episode.index for item in report.plan.items if item.episode.index not in gone]
@@ -362,7 +382,7 @@ class LabelCommand:
         if report.summary is None:
             self.say(f"this shard is labelled; the same command without --shard writes the files from {report.parts}")
             return ExitCode.OK
-        _print(report.summary.rows())
+        print_facts(report.summary.rows())
         for file in report.files:
             typer.echo(f"{file}")
         return ExitCode.OK
@@ -371,19 +391,48 @@ class LabelCommand:
         """Show the summary for existing labels; the source is a dataset or a label file."""
         path = Path(self.source)
         if label_prefix(path) or path.is_dir() or self.labels.output is not None:
-            folder = self.labels.output or (path if path.is_dir() else path.parent)
-            outputs = Outputs(folder, self.labels, label_prefix(path))
+            outputs = self._outputs(self.labels)
             files = [*outputs.progress, *outputs.signals]
             path = next((file for file in files if file.exists()), files[0])
         summary = summarise(path)
         for line in blank_lines(read_blank(path), len(summary.episodes)):
             self.say(f"note: {line}")
-        _print(summary.rows())
+        print_facts(summary.rows())
+
+    def _outputs(self, labels: LabelOptions) -> Outputs:
+        """Where the label files are, as far as is known without opening the dataset."""
+        path = Path(self.source)
+        return Outputs(labels.output or (path if path.is_dir() else path.parent), labels, label_prefix(path))
+
+    def _list(self) -> None:
+        """List the labels that are there."""
+        outputs = self._outputs(self.labels)
+        files = [LabelFile.read(file) for file in find_label_files(Path(self.source), outputs.folder)]
+        require(outputs.folder, bool(files), "label files", "none: label the dataset first, or name its --output")
+        rows = [
+            (reward_name(each.path).removeprefix(outputs.prefix), each.checkpoint or "-", str(len(each.digests) or "-"))
+            for each in files
+        ]
+        print_table("", ("labels", "checkpoint", "episodes"), rows)
+
+    def _remove(self) -> None:
+        """Delete the label files of a name. Raises DatasetError, or typer.Abort after a "no"."""
+        outputs = self._outputs(replace(self.labels, name=self.options.remove or ""))
+        files = outputs.before()
+        require(outputs.folder, bool(files), f"label files {self.options.remove}", "none; --list shows the others")
+        for file in files:
+            require(file.path, bool(file.provenance), "labels of rfm-client", "others: delete the file yourself")
+        what = counted(max(len(file.digests) for file in files), "episode")
+        where = outputs.options.parts or outputs.own_parts
+        is_kept = all(map(outputs.keeps, files))
+        if not (is_kept or self.options.yes):
+            labels = f"labels of {what}, which are not all in {where}"
+            _confirm(f"Delete {labels}?", "--yes for labels that must be scored again", f"none for {labels}")
+        remove_files([file.path for file in files])
+        for file in files:
+            typer.echo(f"deleted {file.path}, labels of {what} by {file.checkpoint}")
+        if is_kept:
+            self.say(f"the same command without --remove writes them again from {where}, which you may delete, too")
 
     def _dataset(self) -> Dataset:
         return open_dataset(self.source, **self.texts.opening)
-
-
-def _print(rows: Sequence[tuple[str, str]]) -> None:
-    print_table("", ("labels", ""), rows)
-    sys.stdout.flush()

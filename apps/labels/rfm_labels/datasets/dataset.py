@@ -129,6 +129,11 @@ class DatasetEpisode:
     tasks: tuple[tuple[int, str], ...] = ()
 
     @property
+    def own_name(self) -> str | None:
+        """The name; None: it only repeats the number, as in LeRobot."""
+        return None if self.name == f"episode {self.index}" else self.name
+
+    @property
     def stretches(self) -> list[tuple[str, int]]:
         """Task and frame count for each stretch with one task, in order."""
         tasks = self.tasks or ((0, self.task),)
@@ -292,6 +297,10 @@ class Dataset(ABC):
     def unused_files(self) -> Sequence[Path]:
         """Return files with rows or frames that no episode uses, relative to ``root``; empty for most layouts."""
         return []
+
+    def doubt(self, episode: DatasetEpisode, camera: str) -> str:
+        """Return what the episode's files say of frames that may be missing, without decoding; empty for nothing."""
+        return ""
 
     @abstractmethod
     def decoder(self, camera: str) -> str | None:

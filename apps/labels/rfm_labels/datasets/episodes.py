@@ -21,7 +21,7 @@ from rfm_client import UInt8Array
 from rfm_client.frames import Picture, Video
 from rfm_labels.datasets.dataset import AskedCorrections, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import faults_of_reader, require
-from rfm_labels.datasets.pictures_in_order import pictures_in
+from rfm_labels.datasets.pictures_in_order import missing_numbers, pictures_in
 from rfm_labels.datasets.recorded import Recorded, RecordedDataset, Stored
 from rfm_labels.datasets.stored_files import (
     Span,
@@ -140,6 +140,9 @@ class _Pictures(Stored):
     def identity(self) -> str:
         of_files = ((file.name, file_identity(file, what="picture") + turn_mark(file)) for file in self._files())
         return digest_of(" ".join(each).encode() for each in of_files)
+
+    def doubt(self) -> str:
+        return missing_numbers([file.name for file in self._files()])
 
     def check(self) -> None:
         check_pictures(self._files())

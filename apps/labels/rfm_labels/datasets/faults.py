@@ -31,6 +31,11 @@ def listed(numbers: Iterable[int]) -> str:
     return ",".join(str(first) if end == first + 1 else f"{first}:{end}" for first, end in runs)
 
 
+def named(number: int, name: str | None) -> str:
+    """Return an episode's number with its own name, if that says more: ``3 (red_cup.mp4)``."""
+    return f"{number} ({name})" if name and name != str(number) else str(number)
+
+
 def shortened(lines: Sequence[str]) -> list[str]:
     """Return the first lines, and a line that counts the rest."""
     more = len(lines) - _MOST_SHOWN

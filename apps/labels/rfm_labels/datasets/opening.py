@@ -275,7 +275,7 @@ def _unlisted(table: Path, kind: str, names: Collection[str]) -> list[str]:
 
 
 def _notes(table: Path, kind: str, gone: Sequence[str]) -> list[str]:
-    note = f"{table.name}: {len(gone)} {kind} beside it are not listed and get no labels: {first_names(gone)}"
+    note = f"{table.name} leaves out {kind} beside it, which get no labels: {first_names(gone)}"
     return [note] if gone else []
 
 

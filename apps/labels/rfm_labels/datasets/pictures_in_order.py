@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 
+from rfm_client.options import counted
 from rfm_labels.datasets.faults import DatasetError, require
 
 _NOT_IN_A_WORD = r"(?<![^\W_])"  # after a letter or digit, - and . are separators: frame-1.png, frame.1.png, 2026-11-26
@@ -59,6 +60,21 @@ def in_order_of_numbers(folder: Path, files: Sequence[str]) -> list[str]:
     if any(_counts_cameras(names, place) for place in range(len(names[0].numbers) if names else 0)):
         raise _several_kinds(folder, files)
     return [name.file for name in names]
+
+
+def missing_numbers(files: Sequence[str]) -> str:
+    """Say where pictures, in order, skip numbers; empty: nowhere, or their numbers have no usual step."""
+    names = [_Name.of(file) for file in files]
+    counts = [column for column in zip(*(name.numbers for name in names), strict=False) if len(set(column)) > 1]
+    if len(counts) != 1 or len({name.words for name in names}) > 1:
+        return ""
+    steps = [after - before for before, after in itertools.pairwise(counts[0])]
+    usual, how_often = Counter(sorted(steps)).most_common(1)[0]
+    gaps = [pair for pair, step in zip(itertools.pairwise(files), steps, strict=True) if step > usual]
+    if not gaps or usual <= 0 or 2 * how_often < len(steps):
+        return ""
+    more = f", and {counted(len(gaps) - 1, 'more such gap')}" if len(gaps) > 1 else ""
+    return f"no picture between {' and '.join(gaps[0])}{more}; were frames dropped while recording?"
 
 
 def _counts_cameras(names: Sequence[_Name], place: int) -> bool:

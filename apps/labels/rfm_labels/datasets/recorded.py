@@ -34,6 +34,10 @@ class Stored(ABC):
         """Return the decoding library; None: pixels, or a reader decodes."""
         return None
 
+    def doubt(self) -> str:
+        """Return the same as ``Dataset.doubt`` for these frames."""
+        return ""
+
     def check(self) -> None:  # noqa: B027 - ``count`` checks most kinds
         """Check what ``count`` has not. Raises DatasetError."""
 
@@ -124,6 +128,9 @@ class RecordedDataset(CountedDataset):
 
     def identity(self, episode: DatasetEpisode, camera: str) -> str:
         return self.recorded[episode.index].cameras[camera].identity()
+
+    def doubt(self, episode: DatasetEpisode, camera: str) -> str:
+        return self.recorded[episode.index].cameras[camera].doubt()
 
     def check(self, episode: DatasetEpisode, camera: str) -> None:
         stored = self.recorded[episode.index].cameras[camera]

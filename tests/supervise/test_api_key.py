@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: MIT
+"""``rfm serve --api-key-file``: one key for the gateway, gRPC and HTTP."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from commands import REPOSITORY
+from gateways import answers
+from rfm.serve.access import callers_restrictions, free_ports
+from rfm.serve.repository_api import RepositoryApi, RepositoryApiError
+from rfm_client import AccessDeniedError, ProgressSample, RewardClient
+from rfm_client.contract.triton import bearer_headers
+from rfm_client.contract.wire import PROGRESS, encode_samples
+from servers import KEY, administered, wait_for
+from trajectories import random_trajectory
+
+API_KEY = "the-key-of-all-callers="
+TRAJECTORY = random_trajectory(0, 3, 64, 32)
+
+
+@pytest.mark.triton
+@pytest.mark.slow
+def test_one_key_opens_every_door_and_none_opens_without_it(tmp_path: Path) -> None:
+    repository = shutil.copytree(REPOSITORY, tmp_path / "model_repository")
+    (tmp_path / "api.key").touch(0o600)
+    (tmp_path / "api.key").write_text(f"{API_KEY}\n")
+    (port,) = free_ports(1)
+    page, asked = f"http://127.0.0.1:{port}", {"samples": [{"sample_type": "progress", "trajectory": _document()}]}
+    options = ["--api-key-file", str(tmp_path / "api.key"), "--gateway-port", str(port)]
+    with administered(repository, *options) as served:
+        assert "needs a key: gRPC, HTTP, page; no key needed: metrics, status" in "\n".join(served.said)
+        wait_for(lambda: answers(page))
+        curves = []
+        for url in (served.endpoints.grpc_url, served.endpoints.http_url):
+            for key in (None, "another-key-of-16-or-more"):
+                with RewardClient(url, api_key=key) as client, pytest.raises(AccessDeniedError, match="restricted"):
+                    client.progress(TRAJECTORY)
+            with RewardClient(url, api_key=API_KEY) as client:
+                curves.append(client.progress(TRAJECTORY).progress)
+        assert httpx.post(f"{page}/evaluate_batch", json=asked).status_code == 401
+        answer = httpx.post(f"{page}/evaluate_batch", json=asked, headers={"X-API-Key": API_KEY})
+        curves.append(np.float32(answer.json()["outputs_progress"]["progress_pred"][0]))
+        np.testing.assert_allclose(curves[1:], curves[:1] * 2, atol=1e-5)
+
+        tensors, grpc = encode_samples([ProgressSample(TRAJECTORY)]), served.endpoints.grpc_url
+        for headers, told in (({}, "none"), (bearer_headers("another"), "another")):
+            with RepositoryApi(grpc, KEY, headers=headers) as api, pytest.raises(RepositoryApiError) as caught:
+                api.infer("rfm", 1, tensors, [PROGRESS])
+            expected = (
+                f"API key: expected that of the server at {grpc} (--api-key-file or RFM_API_KEY_FILE), got {told}"
+            )
+            assert str(caught.value) == expected
+        with RepositoryApi(grpc, KEY, headers=bearer_headers(API_KEY)) as api:
+            assert api.infer("rfm", 1, tensors, [PROGRESS])[PROGRESS].shape[0] == 1
+
+        before = _scored(served.endpoints.metrics_url)
+        wait_for(lambda: _scored(served.endpoints.metrics_url) > before)  # the watch's probes show the key, too
+    assert API_KEY not in served.log.read_text(errors="replace")
+
+
+def _scored(metrics_url: str) -> float:
+    found = re.search(
+        r'^nv_inference_request_success\{model="rfm",.*\} (\d+)', httpx.get(metrics_url).text, re.MULTILINE
+    )
+    assert found is not None
+    return float(found[1])
+
+
+def _document() -> dict[str, object]:
+    return {
+        "task": TRAJECTORY.task,
+        "video_embeddings": TRAJECTORY.video_embeddings.tolist(),  # type: ignore[union-attr]
+        "text_embedding": TRAJECTORY.text_embedding.tolist(),  # type: ignore[union-attr]
+    }
+
+
+def test_a_door_s_own_key_stays() -> None:
+    own = "--grpc-restricted-protocol=health,inference:a=b"
+    assert callers_restrictions("k", [own]) == ["--http-restricted-api=inference,shared-memory:authorization=Bearer k"]
+    assert callers_restrictions(None, []) == []
