@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import av
-import numpy as np
-import numpy.typing as npt
 
 from rfm_client.frames import FrameFileError, Video
 from rfm_labels import DatasetEpisode, DatasetError, find_label_files
@@ -32,6 +30,11 @@ class ShownLeRobot(ShownDataset):
     dataset: LeRobotDataset
 
     @property
+    def bounds(self) -> Path:
+        """The folder; in the Hub's cache that of the repository, to whose blobs a commit's files are links."""
+        return self.root if self.dataset.revision is None else self.root.parents[1].resolve()
+
+    @property
     def has_stored_pixels(self) -> bool:
         """True if all cameras have videos."""
         return not self.dataset.info.images
@@ -41,15 +44,6 @@ class ShownLeRobot(ShownDataset):
         """The cameras with videos, and those with colour pictures."""
         unused, videos = self.dataset.unused_cameras(self.dataset.cameras), self.dataset.info.videos
         return [camera for camera in self.dataset.cameras if camera in videos or camera not in unused]
-
-    @property
-    def fps(self) -> float:
-        """Frames per second, from ``meta/info.json``."""
-        return self.dataset.info.fps
-
-    def times_s(self, episode: DatasetEpisode) -> npt.NDArray[np.float64]:
-        """Return float64 [T], the times in the episode's rows. Raises DatasetError."""
-        return self.dataset.times_s(episode)
 
     def mp4(self, episode: DatasetEpisode, camera: str, take: Callable[[int], object]) -> bytes:
         """Return the episode's part of the stored video, or its pictures as a video. Raises DatasetError."""

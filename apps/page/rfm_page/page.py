@@ -45,7 +45,7 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
         import pyarrow  # noqa: F401
 
         from rfm_labels import DatasetError
-        from rfm_labels.datasets import Hdf5Dataset, LeRobotDataset, open_to_show
+        from rfm_labels.datasets import Hdf5Dataset, LeRobotDataset, hdf5_files, open_to_show
         from rfm_page.datasets import ShownHdf5, ShownLeRobot
         from rfm_page.shown import ShownDataset
     except ModuleNotFoundError as error:
@@ -53,7 +53,7 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
         raise ConfigError.at("dataset", expected, "none: pip install ./apps/labels") from None
     datasets: list[ShownDataset] = []
     try:
-        for path in config.dataset:
+        for path in [each for source in config.dataset for each in [*map(str, hdf5_files(source))] or [source]]:
             dataset = open_to_show(path)
             if isinstance(dataset, LeRobotDataset):
                 datasets.append(ShownLeRobot(dataset))
@@ -70,17 +70,20 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
 def dataset_routes(datasets: Sequence[ShownDataset], limits: BodyLimits) -> APIRouter:
     """Return the endpoints for the page's datasets. The evaluation server has no such endpoints."""
     router = APIRouter(include_in_schema=False)
+    downloading = asyncio.Lock()  # one at a time, since each holds a thread
 
-    async def read(request: Request, number: int, reading: Callable[[ShownDataset], Read]) -> Read:
+    async def read(
+        request: Request, number: int, reading: Callable[[ShownDataset], Read], up_to_s: float | None = limits.timeout_s
+    ) -> Read:
         """Check a dataset and read from it, in a thread, and return the result.
 
         Raises HTTPException 404 for a missing part, 500 for a broken dataset, 504 if reading takes too long.
         """
         if not 0 <= number < len(datasets):
             raise HTTPException(404, f"dataset: expected one of {len(datasets)}, got {number}")
-        with anyio.move_on_after(limits.timeout_s):
+        with anyio.move_on_after(up_to_s):
             return await while_connected(request, asyncio.to_thread(datasets[number].read, reading))
-        raise HTTPException(504, f"dataset: expected an answer within {limits.timeout_s:g} s, got none")
+        raise HTTPException(504, f"dataset: expected an answer within {up_to_s:g} s, got none")
 
     @router.get("/viewer/datasets")
     async def names() -> Response:
@@ -98,6 +101,15 @@ def dataset_routes(datasets: Sequence[ShownDataset], limits: BodyLimits) -> APIR
     @router.get("/viewer/datasets/{dataset}/episodes/{episode}")
     async def curves(request: Request, dataset: int, episode: int, labels: str | None = None) -> Response:
         return _json(await read(request, dataset, lambda shown: shown.curves(episode, labels)))
+
+    @router.get("/viewer/datasets/{dataset}/episodes/{episode}/missing")
+    async def missing(request: Request, dataset: int, episode: int) -> Response:
+        return _json(await read(request, dataset, lambda shown: shown.missing(episode)))
+
+    @router.post("/viewer/datasets/{dataset}/episodes/{episode}/missing")
+    async def download(request: Request, dataset: int, episode: int) -> Response:
+        async with downloading:
+            return _json(await read(request, dataset, lambda shown: shown.download(episode), up_to_s=None))
 
     @router.get("/viewer/datasets/{dataset}/episodes/{episode}/preview")
     async def preview(request: Request, dataset: int, episode: int, labels: str | None = None) -> Response:

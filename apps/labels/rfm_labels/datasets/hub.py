@@ -12,8 +12,15 @@ from pathlib import Path
 from rfm_client.frames import cached_snapshot, hub_errors
 from rfm_labels.datasets.faults import DatasetError
 
+ASK_BYTES = 10e9  # downloads above this need a confirmation
 _METADATA = ["meta/*", "meta_data/*"]  # the second: LeRobot v1, which a message names
 _NAMES_AT_A_TIME = 500  # per request for sizes
+
+
+def size_told(num_files: int, num_bytes: int) -> str:
+    """Return the size of a download, for users."""
+    size = f"{num_bytes / 1e9:.2f} GB" if num_bytes >= 1e9 else f"{num_bytes / 1e6:.1f} MB"
+    return f"{size} in {num_files} files"
 
 
 class HubFiles:

@@ -73,6 +73,11 @@ export async function curvesOf(number, episode, labels, signal) {
   return (await answer(`viewer/datasets/${number}/episodes/${episode}${chosen(labels)}`, { signal })).json();
 }
 
+/** What an episode needs from the Hub: its `size`, null if all is here, and whether it `asks` before; begins: downloads it first */
+export async function missingOf(number, episode, signal, begins = false) {
+  return (await answer(`viewer/datasets/${number}/episodes/${episode}/missing`, { signal, ...(begins && { method: "POST" }) })).json();
+}
+
 /** A few points of an episode's curve, and a small picture. */
 export async function previewOf(number, episode, labels, signal) {
   return (await answer(`viewer/datasets/${number}/episodes/${episode}/preview${chosen(labels)}`, { signal })).json();

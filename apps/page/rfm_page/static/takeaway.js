@@ -105,7 +105,7 @@ function labelLine(group, url) {
   const options = ["--episodes", origin.episode, "--cameras", cameras.join(","), ...corrections, ...sampling(rule, sampledFrames)];
   const given = task === origin.task ? [] : ["--task", task, "--override-task"];
   const words = ["rfm-client", "label", origin.dataset, ...serverOption(url), "--model", model, ...given, ...options];
-  const target = ["--output", `${origin.dataset}_episode_${origin.episode}`, "--format", "progress"];
+  const target = ["--output", `${origin.dataset.replace("/", "_")}_episode_${origin.episode}`, "--format", "progress"];
   return [...words, ...(resize ? ["--resize"] : []), ...target].map(quoted).join(" ");
 }
 
