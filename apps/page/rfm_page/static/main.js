@@ -258,6 +258,7 @@ function scoreAll() {
   places.errors.clear();
   page.status.textContent = "";
   if (page.score.disabled) return;
+  sidebar.giveWay();
   const known = new Set(curves.filter(({ error }) => !error).map(({ identity }) => identity));
   for (const video of videos.all) {
     for (const task of tasks()) {
