@@ -462,10 +462,8 @@ def test_only_the_files_of_the_chosen_episodes_and_cameras_are_downloaded(
     texts, few = EpisodeTexts(), LabelOptions(output=tmp_path / "out", episodes=[3], cameras=[WRIST], frames=4)
     command = LabelCommand(address, texts, few, RunOptions(), RayOptions(), lambda: nullcontext(engine), notes.append)
     with local_hub.hub({HUB_ID: {"main": source}}, "datasets") as endpoint, local_hub.asked(endpoint, tmp_path / "hub"):
-        monkeypatch.setattr("rfm_labels.commands.label.ASK_BYTES", 10)
-        with pytest.raises(
-            ConfigError, match=r"^yes: expected --yes for more than 1e-08 GB, got none for 0\.\d MB in 2 "
-        ):
+        monkeypatch.setattr("rfm_labels.datasets.hub.ASK_BYTES", 10)
+        with pytest.raises(ConfigError, match=r"^yes: expected --yes for more than 10 GB, got none for 0\.\d MB in 2 "):
             command.run()
         monkeypatch.undo()
         assert command.run() == 0

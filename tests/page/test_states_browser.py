@@ -150,7 +150,7 @@ def test_an_episode_on_the_hub_opens_once_it_is_downloaded_and_a_large_download_
     ):
         browser.driver.get(f"{gateway.url}/#tab=dataset&episode=3")
         browser.until("document.querySelectorAll('#episode-videos video').length === 2")
-        monkeypatch.setattr("rfm_page.shown.ASK_BYTES", 10)
+        monkeypatch.setattr("rfm_labels.datasets.hub.ASK_BYTES", 10)
         browser.run("document.querySelector('#episodes tr[data-episode=\"5\"] button').click()")
         told = wait_for_state(browser, "episode-errors")
         assert re.fullmatch(r"A large download\nEpisode 5 needs 0\.\d MB in 3 files from the Hub\.\nDownload", told)

@@ -33,7 +33,7 @@ from paths import ROOT
 from rfm_client.frames import read_video
 from rfm_client.options import ConfigError
 from rfm_labels import LabelOptions, label, open_dataset, read_episode_labels
-from rfm_labels.datasets import LeRobotDataset, hdf5_files, open_to_show
+from rfm_labels.datasets import LeRobotDataset, open_to_show
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew, hdf5
 
 V21, V30 = range(2)  # datasets with labels; one without follows
@@ -176,7 +176,7 @@ def folder_of_hdf5(folder: Path) -> Path:
 )
 def test_pictures_are_shown_as_a_video(tmp_path: Path, make: Callable[[Path], Path | str]) -> None:
     root = make(tmp_path)
-    dataset = open_to_show(str(next(iter(hdf5_files(root)), root)))
+    (dataset,) = open_to_show(str(root))
     fps = 5 if make is folder_of_videos else 10
     number, camera = dataset.numbers[1], len(dataset.cameras) - 1
     with serving(root) as get:
@@ -274,7 +274,7 @@ def test_of_a_dataset_on_the_hub_only_the_watched_episode_is_downloaded_after_it
         ]
         size = f"{sum((source / name).stat().st_size for name in needed) / 1e6:.1f} MB in 3 files"
         assert get(f"{path}/missing").json() == {"size": size, "asks": False}
-        monkeypatch.setattr("rfm_page.shown.ASK_BYTES", 10)
+        monkeypatch.setattr("rfm_labels.datasets.hub.ASK_BYTES", 10)
         assert get(f"{path}/missing").json()["asks"] is True
         assert here() == []
         all_here = {"size": None, "asks": False}

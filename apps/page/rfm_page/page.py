@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -45,7 +46,7 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
         import pyarrow  # noqa: F401
 
         from rfm_labels import DatasetError
-        from rfm_labels.datasets import Hdf5Dataset, LeRobotDataset, hdf5_files, open_to_show
+        from rfm_labels.datasets import Hdf5Dataset, LeRobotDataset, open_to_show
         from rfm_page.datasets import ShownHdf5, ShownLeRobot
         from rfm_page.shown import ShownDataset
     except ModuleNotFoundError as error:
@@ -53,8 +54,7 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
         raise ConfigError.at("dataset", expected, "none: pip install ./apps/labels") from None
     datasets: list[ShownDataset] = []
     try:
-        for path in [each for source in config.dataset for each in [*map(str, hdf5_files(source))] or [source]]:
-            dataset = open_to_show(path)
+        for dataset in chain.from_iterable(map(open_to_show, config.dataset)):
             if isinstance(dataset, LeRobotDataset):
                 datasets.append(ShownLeRobot(dataset))
             elif isinstance(dataset, Hdf5Dataset):

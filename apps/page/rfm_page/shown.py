@@ -37,7 +37,6 @@ from rfm_labels import (
     read_provenance,
     summarise,
 )
-from rfm_labels.datasets import ASK_BYTES, size_told
 
 Read = TypeVar("Read")
 
@@ -152,9 +151,8 @@ class ShownDataset:
 
     def missing(self, number: int) -> dict[str, Any]:
         """Return the size of what an episode needs from the Hub, null: all is here, and whether to ask before."""
-        sizes = self.dataset.missing([self._numbered(number)], self.cameras)
-        num_bytes = sum(sizes.values())
-        return {"size": size_told(len(sizes), num_bytes) if sizes else None, "asks": num_bytes > ASK_BYTES}
+        size = self.dataset.missing([self._numbered(number)], self.cameras)
+        return {"size": str(size) if size else None, "asks": size is not None and size.is_large}
 
     def download(self, number: int) -> dict[str, Any]:
         """Download what an episode needs from the Hub, and return what is missing then."""

@@ -20,7 +20,7 @@ from rfm_labels.audit import audit
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, SeveralTasks, parsed_by_camera
 from rfm_labels.datasets.faults import FaultsError, UnusedTaskError, listed, require
 from rfm_labels.datasets.hdf5 import label_prefix
-from rfm_labels.datasets.hub import ASK_BYTES, size_told
+from rfm_labels.datasets.hub import ASK_BYTES, DownloadSize
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
 from rfm_labels.datasets.opening import hdf5_files, open_dataset
 from rfm_labels.label_files import read_blank
@@ -88,9 +88,9 @@ class ProgressBar(Watch):
 
     def downloading(self, num_files: int, num_bytes: int) -> None:
         """Write how much is downloaded. Raises ConfigError, or typer.Abort after a "no", for a large download."""
-        size = size_told(num_files, num_bytes)
+        size = DownloadSize(num_files, num_bytes)
         self.note(f"downloading {size}, all that the chosen episodes and cameras need")
-        if num_bytes <= ASK_BYTES or self._accepts:
+        if not size.is_large or self._accepts:
             return
         if not sys.stdin.isatty():
             remedy = "choose fewer episodes (--episodes, --limit) or cameras (--cameras)"

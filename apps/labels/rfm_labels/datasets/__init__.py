@@ -3,18 +3,8 @@
 
 from rfm_labels.datasets.hdf5 import Hdf5Dataset
 from rfm_labels.datasets.hdf5_contents import opened_hdf5
-from rfm_labels.datasets.hub import ASK_BYTES, size_told
 from rfm_labels.datasets.lerobot import LeRobotDataset
-from rfm_labels.datasets.opening import hdf5_files, open_to_show
+from rfm_labels.datasets.opening import open_to_show
 from rfm_labels.datasets.stored_files import Span
 
-__all__ = [
-    "ASK_BYTES",
-    "Hdf5Dataset",
-    "LeRobotDataset",
-    "Span",
-    "hdf5_files",
-    "open_to_show",
-    "opened_hdf5",
-    "size_told",
-]
+__all__ = ["Hdf5Dataset", "LeRobotDataset", "Span", "open_to_show", "opened_hdf5"]

@@ -20,6 +20,7 @@ from rfm_client import RewardError, Trajectory, UInt8Array
 from rfm_client.frames import ChannelOrder, Correction, Orientation
 from rfm_client.options import ConfigError, is_blank
 from rfm_labels.datasets.faults import DatasetError, FaultsError, MissingTaskError, UnusedTaskError, require
+from rfm_labels.datasets.hub import DownloadSize
 from rfm_labels.datasets.stored_files import Times
 
 LEAST_SIZE_PX = 8  # per side; a smaller numeric array is no picture
@@ -290,12 +291,9 @@ class Dataset(ABC):
         accept: called before a download with its files and bytes; may raise an error
         """
 
-    def missing(self, numbers: Sequence[int], cameras: Sequence[str]) -> Mapping[str, int]:
-        """Return the sizes in bytes, by name, of files that these episodes and cameras need from the Hub.
-
-        Raises DatasetError.
-        """
-        return {}
+    def missing(self, numbers: Sequence[int], cameras: Sequence[str]) -> DownloadSize | None:
+        """Return what these episodes and cameras need from the Hub; None: all is here. Raises DatasetError."""
+        return None
 
     def is_here(self, number: int) -> bool:
         """True if nothing of an episode must be downloaded first."""

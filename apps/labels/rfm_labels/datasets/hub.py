@@ -6,6 +6,7 @@ from __future__ import annotations
 import glob
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
@@ -17,10 +18,21 @@ _METADATA = ["meta/*", "meta_data/*"]  # the second: LeRobot v1, which a message
 _NAMES_AT_A_TIME = 500  # per request for sizes
 
 
-def size_told(num_files: int, num_bytes: int) -> str:
-    """Return the size of a download, for users."""
-    size = f"{num_bytes / 1e9:.2f} GB" if num_bytes >= 1e9 else f"{num_bytes / 1e6:.1f} MB"
-    return f"{size} in {num_files} files"
+@dataclass(frozen=True)
+class DownloadSize:
+    """The size of a download. ``str`` tells users."""
+
+    num_files: int
+    num_bytes: int
+
+    @property
+    def is_large(self) -> bool:
+        """True if users are asked first."""
+        return self.num_bytes > ASK_BYTES
+
+    def __str__(self) -> str:
+        size = f"{self.num_bytes / 1e9:.2f} GB" if self.num_bytes >= 1e9 else f"{self.num_bytes / 1e6:.1f} MB"
+        return f"{size} in {self.num_files} files"
 
 
 class HubFiles:

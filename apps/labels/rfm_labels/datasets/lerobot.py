@@ -18,7 +18,7 @@ from rfm_client.frames import Picture, Video
 from rfm_client.options import InvalidValueError, checked_finite
 from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, listed, require
-from rfm_labels.datasets.hub import HubFiles
+from rfm_labels.datasets.hub import DownloadSize, HubFiles
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S, Frames, Part, VideoRows
 from rfm_labels.datasets.lerobot_meta import (
     EPISODES_FILE,
@@ -125,13 +125,18 @@ class LeRobotDataset(Dataset):
     def download(
         self, numbers: Sequence[int], cameras: Sequence[str], accept: Callable[[int, int], None] | None = None
     ) -> None:
-        sizes = self.missing(numbers, cameras)
+        sizes = self._sizes(numbers, cameras)
         if sizes and accept is not None:
             accept(len(sizes), sum(sizes.values()))
         if self._hub is not None:
             self._hub.download(self.root / name for name in sizes)
 
-    def missing(self, numbers: Sequence[int], cameras: Sequence[str]) -> Mapping[str, int]:
+    def missing(self, numbers: Sequence[int], cameras: Sequence[str]) -> DownloadSize | None:
+        sizes = self._sizes(numbers, cameras)
+        return DownloadSize(len(sizes), sum(sizes.values())) if sizes else None
+
+    def _sizes(self, numbers: Sequence[int], cameras: Sequence[str]) -> Mapping[str, int]:
+        """The sizes in bytes of the files that are only on the Hub, by name."""
         return {} if self._hub is None else self._hub.sizes(self._files_of(numbers, cameras))
 
     def is_here(self, number: int) -> bool:

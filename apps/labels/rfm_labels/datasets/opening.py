@@ -179,8 +179,10 @@ def _on_hub(source: str | Path) -> HubFiles:
     return hub
 
 
-def open_to_show(source: str) -> Dataset:
-    """Open a dataset for a viewer, from a path, the Hub, ``READER=FOLDER`` or ``PATTERN=FOLDER``. Raises DatasetError.
+def open_to_show(source: str) -> list[Dataset]:
+    """Open what a viewer shows: a dataset, for a folder of HDF5 files one for each. Raises DatasetError.
+
+    source: path, Hub id or address, ``READER=FOLDER`` or ``PATTERN=FOLDER``
 
     Accepts blank and outdated tasks. In a LeRobot dataset, a row shows the nearest frame, as a player does.
     """
@@ -188,16 +190,16 @@ def open_to_show(source: str) -> Dataset:
     no_tasks, as_stored = TaskOverride(is_needed=False), AskedCorrections()
     require("", bool(folder) or not (is_reader(how) or "{episode}" in how), f"{how}=FOLDER", source)
     if is_reader(how):
-        return open_read(how, Path(folder).resolve(), no_tasks, as_stored)
+        return [open_read(how, Path(folder).resolve(), no_tasks, as_stored)]
     if "{episode}" in how:
-        return _by_pattern(Path(folder).resolve(), how, no_tasks, as_stored)
+        return [_by_pattern(Path(folder).resolve(), how, no_tasks, as_stored)]
     path = Path(source).resolve()
     hub = None if path.exists() else _on_hub(source)
     root = path if hub is None else hub.folder
     if (root / INFO_FILE).is_file():
         task = TaskOverride(column=TASK_COLUMN, is_needed=False)
-        return LeRobotDataset(root, hub=hub, task=task, tolerance_s=0.5 / Info.read(root).fps)
-    return _open_path(path, no_tasks, as_stored)
+        return [LeRobotDataset(root, hub=hub, task=task, tolerance_s=0.5 / Info.read(root).fps)]
+    return [_open_path(each, no_tasks, as_stored) for each in hdf5_files(path) or [path]]
 
 
 def hdf5_files(folder: str | Path) -> list[Path]:
