@@ -196,23 +196,52 @@ def test_the_pointer_the_keys_and_the_button_move_the_videos_and_the_numbers(pag
     page.browser.until_text("play", "Pause")
 
 
-def test_a_pair_is_compared_in_both_orders(page: Page) -> None:
-    page.score("success", "failure")
+def compared(page: Page, *names: str) -> tuple[Any, Any]:
+    """Score and compare videos. Return the comparison that the page saves, and the one of its command line."""
+    page.score(*names)
     page.browser["compare"].click()
-    page.browser.until("document.querySelector('#pairs p')")
+    page.browser.until("document.querySelector('#pairs ol')")
     (answer,) = page.saved()["comparisons"]
-    commands = [line for line in page.browser["command"].text.splitlines() if line.startswith("rfm-client compare")]
-    shown = [item.text for item in page.browser.all("#pairs li")]
-    for place, order, command, line in zip(("first", "second"), answer["orders"], commands, shown, strict=True):
-        preference = by_command_line(page.videos, f"{command} --json pair.json")["preference"]
-        assert order["preference"] == pytest.approx(preference, abs=TOLERANCE)
-        told = re.fullmatch(rf"P\(success\.mp4 is better\) = ([\d.]+) \(shown {place}\)", line)
-        assert told
-        better = preference if place == "first" else 1 - preference
-        assert float(told[1]) == pytest.approx(better, abs=SHOWN + TOLERANCE)
+    (command,) = [line for line in page.browser["command"].text.splitlines() if line.startswith("rfm-client compare")]
+    told = by_command_line(page.videos, f"{command} --json ranking.json")
+    for ours, theirs in zip(answer["orders"], told["orders"], strict=True):
+        assert ours.pop("preference") == pytest.approx(theirs.pop("preference"), abs=TOLERANCE)
+        assert ours == theirs
+    assert answer["pairs"] == told["pairs"]
+    assert [video["rank"] for video in answer["videos"]] == [video["rank"] for video in told["videos"]]
+    return page.saved()["comparisons"][0], told
+
+
+def test_several_videos_are_ranked_as_by_the_command_line(page: Page) -> None:
+    clip.write(page.videos / "nothing.mp4", make_clip("stopped", Task("red", "bowl"), 2_000_002).frames, FPS)
+    answer, told = compared(page, "success", "failure", "nothing")
+    best_first = sorted(told["videos"], key=lambda video: -video["wins"])
+    assert page.browser.run("return [...document.querySelectorAll('#pairs li')].map((item) => item.textContent)") == [
+        f"{video['rank'] or '?'}. {video['source']}P(wins) = {video['wins']:.3f}" for video in best_first
+    ]
+    widths = page.browser.run(
+        "return [...document.querySelectorAll('#pairs .share')].map((bar) => bar.firstChild.offsetWidth / bar.offsetWidth)"
+    )
+    assert widths == pytest.approx([video["wins"] for video in best_first], abs=0.02)
+    assert page.browser.run("return document.querySelectorAll('#pairs details p').length") == 3
+    page.browser.all("#videos .remove")[2].click()
+    assert page.browser.all("#pairs li") == []
+    assert len(answer["pairs"]) == 3
+
+
+def test_a_pair_is_compared_in_both_orders(page: Page) -> None:
+    answer, _ = compared(page, "success", "failure")
+    orders = [order["preference"] for order in answer["orders"]]
+    (line,) = page.browser.all("#pairs details p")
+    told = re.fullmatch(
+        r"P\(success\.mp4 is better than failure\.mp4\) = ([\d.]+) shown first, ([\d.]+) shown second", line.text
+    )
+    assert told
+    assert [float(text) for text in told.groups()] == pytest.approx([orders[0], 1 - orders[1]], abs=SHOWN + TOLERANCE)
     assert page.browser.all("#pairs h2")[0].text == "success.mp4 does the task better"
     assert page.browser.all("#pairs p")[0].text == f"{TASK} (rfm). Both orders agree."
-    assert (answer["verdict"], answer["orders_agree"]) == ("first", True)
+    (pair,) = answer["pairs"]
+    assert (pair["verdict"], pair["orders_agree"]) == ("first", True)
     status = page.browser["status"]
     assert (status.text, status.aria_role) == ("success.mp4 does the task better.", "status")
     before = page.saved()

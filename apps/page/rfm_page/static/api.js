@@ -36,7 +36,7 @@ export async function served() {
   return (await answer("viewer/served")).json();
 }
 
-/** What the model prefers of two videos, asked in both orders. */
+/** How the model ranks videos, each pair asked in both orders. */
 export async function compare(form, signal) {
   return (await answer("viewer/compare", { method: "POST", body: form, signal })).json();
 }

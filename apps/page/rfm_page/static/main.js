@@ -21,7 +21,7 @@ import { Tabs } from "./tabs.js";
 import { Timeline } from "./timeline.js";
 import { commands, csv, json, save } from "./takeaway.js";
 import { learn, toldAt } from "./signals.js";
-import { addVerdict, areOneFile, sentenceOf } from "./verdicts.js";
+import { addVerdict, ofOneFile, sentenceOf } from "./verdicts.js";
 
 const CURVES_AT_A_TIME = 3;
 
@@ -297,27 +297,28 @@ function showEnds() {
   if (isOver && !videos.isPlaying) timeline.moveTo(Infinity);
 }
 
-async function comparePair() {
-  const [first, second] = videos.all;
+async function compareAll() {
+  const all = videos.all;
   const { model, fps, resize } = settings();
-  const { orient, channels } = first;
+  const { orient, channels } = all[0];
   const before = verdicts.length;
   places.errors.clear();
   page.compare.disabled = true;
   try {
     if (!tasks().length) throw new Error("task: expected a sentence, got none");
     for (const name of ["orient", "channels"]) {
-      if (second[name] !== first[name]) throw new Error(`${name}: expected the same of both videos, got ${first[name]} and ${second[name]}`);
+      const other = all.find((video) => video[name] !== all[0][name]);
+      if (other) throw new Error(`${name}: expected the same of all videos, got ${all[0][name]} and ${other[name]}`);
     }
-    const isOneFile = await areOneFile(first.file, second.file);
-    if (isOneFile) tell({ videos: [first, second], answer: null });
-    for (const task of isOneFile ? [] : tasks()) {
-      const data = form({ task, model, fps, orient, channels, resize }, { first: first.file, second: second.file });
-      const answer = await compare(data, stopping.signal);
-      tell({ videos: [first, second], task, model, fps, orient, channels, resize, answer });
+    const twice = await ofOneFile(all);
+    if (twice) tell({ videos: twice, answer: null });
+    for (const task of twice ? [] : tasks()) {
+      const files = Object.fromEntries(all.map(({ file }, index) => [`video_${index}`, file]));
+      const answer = await compare(form({ task, model, fps, orient, channels, resize }, files), stopping.signal);
+      tell({ videos: all, task, model, fps, orient, channels, resize, answer });
     }
   } catch (error) {
-    if (!stopping.signal.aborted) failed(error, "The videos could not be compared", comparePair);
+    if (!stopping.signal.aborted) failed(error, "The videos could not be compared", compareAll);
   }
   update();
   if (verdicts.length > before) page.status.textContent = verdicts.slice(before).map(sentenceOf).join(" ");
@@ -466,7 +467,7 @@ function update() {
   }
   showTable(page.curves, curves, Number(page.threshold.value));
   page.stop.disabled = queue.isIdle;
-  page.compare.disabled = videos.all.length !== 2 || !page.model.value;
+  page.compare.disabled = videos.all.length < 2 || !page.model.value;
   page.take.hidden = !scored.length && !answered().length;
   page.verdicts.hidden = !verdicts.length;
   page.png.disabled = page.svg.disabled = page.csv.disabled = !scored.length;
@@ -527,7 +528,7 @@ listen(page.rule, { change: showLimits });
 for (const select of [page.orient, page.channels]) listen(select, { change: () => videos.correct(correction()) });
 listen(page.stop, { click: stop });
 listen(page.clear, { click: clearForNow });
-listen(page.compare, { click: comparePair });
+listen(page.compare, { click: compareAll });
 listen(page.threshold, { input: showThreshold });
 listen(page.tasks, { keydown: (event) => { if (event.key === "Enter" && (event.ctrlKey || event.metaKey)) scoreAll(); } });
 listen(page.examples, { click: ({ target }) => {
