@@ -24,6 +24,7 @@ pytestmark = [pytest.mark.triton, pytest.mark.slow]
 NOWHERE = Endpoints(http_port=1, grpc_port=1, metrics_port=1)
 KEY = "open sesame"
 THEMES = ("light", "dark")
+PANEL = "return document.querySelector('.panel:not([hidden])').getBoundingClientRect().toJSON()"
 
 
 def wait_for_state(browser: Browser, place: str) -> str:
@@ -65,7 +66,9 @@ def test_a_page_goes_on_without_a_reload_when_triton_a_key_and_a_broken_dataset_
         )
         assert middle == pytest.approx(0.5, abs=0.02)  # not in the column of the settings
         without_violations(browser)
+        before = browser.run(PANEL)
     assert wait_for_state(browser, "away").startswith("The server does not answer")  # the page asks on
+    assert browser.run(PANEL) == before
     assert "connection refused" not in browser["away"].text.lower()
     without_violations(browser)
     with running(demo_server, tmp_path, "rfm", "--dataset", str(root), port=port, RFM_GATEWAY_API_KEY=KEY):

@@ -26,6 +26,7 @@ import clip
 from browsers import REBOUND, Browser
 from gateways import Gateway, running
 from paths import VIDEOS
+from rfm_client.contract.description import TOY
 from rfm_client.frames import ChannelOrder, Correction, Orientation
 from servers import Endpoints, folder_server, wait_for
 from tolerances import SHOWN, TOLERANCE
@@ -104,6 +105,7 @@ def test_dropped_clips_get_the_curves_of_the_command_line(page: Page) -> None:
     page.score("success", "failure")
     document = page.saved()
     assert [video["source"] for video in document["videos"]] == ["success.mp4", "failure.mp4"]
+    assert page.browser["warning"].text == TOY
     videos = by_command_line(page.videos, page.browser["command"].text)["videos"]
     for shown, video, row in zip(document["videos"], videos, page.browser.cells("#curves tr"), strict=True):
         for name in ("progress", "success", "frame_times_s"):
@@ -370,7 +372,7 @@ def test_tasks_are_overlaid_colours_tell_videos_apart_and_lines_tell_tasks_apart
     assert len(found) == 4
     assert [len({line[part] for line in found}) for part in (0, 1)] == [2, 2]
     told = texts(figure(page))
-    assert told[:3] == ["2 tasks", "2 videos", "demo_checkpoint/checkpoint"]
+    assert told[:3] == ["2 tasks", "2 videos", TOY]
     assert told[-4:] == ["success.mp4", "failure.mp4", TASK, OTHER_TASK]  # each video's colour, then each task's line
     page.browser.all("#legend .remove")[1].click()
     assert [row[1] for row in page.browser.cells("#curves tr")] == [TASK, TASK]
@@ -427,7 +429,7 @@ def test_the_figure_fits_a_column_of_a_paper_and_is_light(page: Page) -> None:
     assert np.asarray(picture)[[0, 0, -1], [0, -1, -1]].tolist() == [[255] * 3] * 3
     assert (np.asarray(picture).std(axis=2) > 20).any()  # the coloured lines
     assert svg.attrib["width"] == "252pt"
-    names = {TASK, "demo_checkpoint/checkpoint", "success.mp4", "failure.mp4", "progress", "success", "time (s)"}
+    names = {TASK, TOY, "success.mp4", "failure.mp4", "progress", "success", "time (s)"}
     assert names <= set(texts(svg))
     lines = [
         [tuple(map(float, point.split(","))) for point in line.attrib["points"].split()]

@@ -99,20 +99,24 @@ def test_the_table_and_the_curves_are_those_of_the_labels(get: Get, folders: lis
         np.testing.assert_array_equal(curves, [columns[name] for name in pair])
 
 
-def test_a_preview_has_the_first_frame_as_for_the_labels_and_a_few_points(get: Get, folders: list[Path]) -> None:
-    preview = get(f"/{V21}/episodes/1/preview").json()
-    labels = columns_of(folders[V21], 1)["progress_sparse"]
-    assert len(labels) <= 32
-    assert preview["progress"] == pytest.approx(labels.tolist(), abs=1e-6)
-    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(preview["picture"]))))
-    dataset = LeRobotDataset(folders[V21])
-    frame = next(dataset.stored_frames(dataset.episode(1), CAMERAS[0]))
-    expected = Image.fromarray(frame)
-    expected.thumbnail((96, 72))
-    assert np.abs(picture.astype(int) - np.asarray(expected)).mean() < 5
+def test_a_preview_has_the_first_and_the_last_frame_as_for_the_labels_and_a_few_points(
+    get: Get, folders: list[Path]
+) -> None:
+    for number in (V21, V30):
+        preview = get(f"/{number}/episodes/1/preview").json()
+        labels = columns_of(folders[number], 1)["progress_sparse"]
+        places = np.linspace(0, len(labels) - 1, min(32, len(labels))).round().astype(int)
+        assert preview["progress"] == pytest.approx(labels[places].tolist(), abs=1e-6)
+        dataset = LeRobotDataset(folders[number])
+        frames = list(dataset.stored_frames(dataset.episode(1), CAMERAS[0]))
+        for stored, end in zip(preview["pictures"], (frames[0], frames[-1]), strict=True):
+            picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(stored))))
+            expected = Image.fromarray(end)
+            expected.thumbnail((96, 72))
+            assert np.abs(picture.astype(int) - np.asarray(expected)).mean() < 5
     plain = get("/2/episodes/1/preview").json()
     assert plain["progress"] == []
-    assert plain["picture"]
+    assert plain["pictures"]
     assert "expected one from 0 to" in failure(get("/0/episodes/99/preview"), 404)
 
 
@@ -266,7 +270,7 @@ def test_of_a_dataset_on_the_hub_only_the_watched_episode_is_downloaded_after_it
         assert [[row[name] for name in names] for row in get("/0").json()["episodes"]] == [
             [each.index, each.task, each.num_frames] for each in LeRobotDataset(source).episodes
         ]
-        assert (get("/0/faults").json(), get(f"{path}/preview").json()["picture"]) == ({}, None)
+        assert (get("/0/faults").json(), get(f"{path}/preview").json()["pictures"]) == ({}, [])
         assert here() == []
         needed = [
             "data/chunk-000/episode_000003.parquet",
@@ -281,7 +285,7 @@ def test_of_a_dataset_on_the_hub_only_the_watched_episode_is_downloaded_after_it
         assert gateway.post(f"/viewer/datasets{path}/missing").json() == all_here
         assert here() == needed
         check_frames(get, source, 3)
-        assert get(f"{path}/preview").json()["picture"]
+        assert len(get(f"{path}/preview").json()["pictures"]) == 2
         assert here() == needed
     with serving(source) as get:
         assert get(f"{path}/missing").json() == all_here

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import base64
 import io
+import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -197,7 +199,7 @@ class ShownDataset:
         return self.mp4(self._episode(number), self.cameras[camera], take)
 
     def preview(self, number: int, labels: str | None, take: Callable[[int], object]) -> dict[str, Any]:
-        """Return an episode's progress at a few points, and its first frame as JPEG in base64; null: it cannot be read.
+        """Return an episode's progress at a few points, and its ``ends`` as JPEG in base64; none: they cannot be read.
 
         take: see ``video``
         """
@@ -211,24 +213,17 @@ class ShownDataset:
         camera = next((each for each in self.cameras if each not in unused), None)
         if not self.dataset.is_here(number):
             camera = None
-        try:
-            picture = None if camera is None else self._picture(self._episode(number), file, camera, take)
-        except DatasetError:  # the list of faults reports it
-            picture = None
-        return {"progress": [] if progress is None else progress.tolist(), "picture": picture}
+        pictures: list[str] = []
+        if camera is not None:
+            with suppress(DatasetError):  # the list of faults reports it
+                correction = self._correction(file, camera)
+                ends = self.ends(self._episode(number), camera)
+                pictures = [_jpeg(correction.applied(frame), take) for frame in ends]
+        return {"progress": [] if progress is None else progress.tolist(), "pictures": pictures}
 
-    def _picture(
-        self, episode: DatasetEpisode, file: Path | None, camera: str, take: Callable[[int], object]
-    ) -> str | None:
-        frame = next(self.dataset.stored_frames(episode, camera), None)
-        if frame is None:
-            return None
-        take(frame.nbytes)
-        image = Image.fromarray(self._correction(file, camera).applied(frame))
-        image.thumbnail(_PREVIEW_PX)
-        jpeg = io.BytesIO()
-        image.save(jpeg, "JPEG")
-        return base64.b64encode(jpeg.getvalue()).decode()
+    def ends(self, episode: DatasetEpisode, camera: str) -> list[UInt8Array]:
+        """Return the first stored frame, and the last where it is read without the others. Raises DatasetError."""
+        return list(itertools.islice(self.dataset.stored_frames(episode, camera), 1))
 
     def _without_folder(self, message: str) -> str:
         """Return a message without the folder's path, for users on other machines."""
@@ -330,6 +325,16 @@ def _mux(container: Any, packets: Sequence[Any], take: Callable[[int], object]) 
     for packet in packets:
         take(packet.size)
         container.mux(packet)
+
+
+def _jpeg(frame: UInt8Array, take: Callable[[int], object]) -> str:
+    """Return a frame as a small JPEG in base64. take: see ``encoded``"""
+    take(frame.nbytes)
+    image = Image.fromarray(frame)
+    image.thumbnail(_PREVIEW_PX)
+    jpeg = io.BytesIO()
+    image.save(jpeg, "JPEG")
+    return base64.b64encode(jpeg.getvalue()).decode()
 
 
 def links_in(folder: Path) -> Iterator[Path]:

@@ -45,6 +45,7 @@ from rfm_client.cli.show import (
     scores_table,
     status_tables,
 )
+from rfm_client.contract.description import TOY
 from rfm_client.contract.errors import DeadlineExceededError, RewardError
 from rfm_client.contract.results import FRAME_SCORES
 from rfm_client.plot import save
@@ -118,6 +119,8 @@ def score(
         outcomes = scoring.SourceScorer(client, video, prefix, recording).score_all(videos, tell)
     if output.prints_tables and shown:
         print("\n  " + " ".join(filter(None, (prefix.rule, in_place_of_progress(each.result for each in shown)))))
+    if any(each.checkpoint == TOY for each in shown):
+        report(f"note: {TOY}")
     output.write_json(documents.score_document(server, video, prefix, outcomes))
     if output.plot is not None and shown:
         save(scoring.figure(shown, video.task), output.plot)

@@ -216,9 +216,9 @@ def _evaluate(
 
 
 def checkpoint_of(client: RewardClient, trajectory: Trajectory) -> str:
-    """Return where the checkpoint that scores the trajectory comes from, else the model's name."""
+    """Return what a figure says of the checkpoint that scores the trajectory: a warning, its source or its name."""
     info = client.model_info(frames=trajectory.frames is not None)
-    return info.source or info.name
+    return info.warning or info.source or info.name
 
 
 def heading(task: str, checkpoints: Iterable[str]) -> str:

@@ -337,6 +337,7 @@ export class DatasetTab {
     this.#shown = sorted(kept(this.#episodes, filters, page["task-part"].value), page.order.value, this.#isTurned);
     this.#showNoHits();
     this.#table.show(this.#shown, this.#threshold);
+    page["order-told"].textContent = this.#isTurned ? "" : page.order.selectedOptions[0]?.title ?? "";
     page["shown-told"].textContent = `${this.#shown.length} of ${this.#episodes.length}`;
     for (const head of page["episode-list"].querySelectorAll("th[data-order]")) {
       const isFalling = ["backwards", "disagreement", "difference"].includes(head.dataset.order) !== this.#isTurned;

@@ -142,6 +142,8 @@ function chooseRule() {
   const model = gateway.models.find(({ name }) => name === page.model.value);
   if (model) page.rule.value = model.rule;
   page["one-view"].hidden = !model?.reads_views;
+  page.warning.textContent = model?.warning ?? "";
+  page.warning.hidden = !model?.warning;
   page.threshold.parentElement.hidden = model?.has_success === false;
   showLimits();
 }
@@ -443,7 +445,7 @@ function figure() {
     return names.size === 1 ? told(scored[0]) : `${names.size} ${kind}`;
   };
   const episodeOf = ({ name, video: { origin } }) => (origin?.dataset ? `${origin.dataset}, episode ${origin.episode}` : name);
-  const titles = [named(({ task }) => task, "tasks"), named(episodeOf, "videos"), named(checkpointOf, "checkpoints")];
+  const titles = [named(({ task }) => task, "tasks"), named(episodeOf, "videos"), named((curve) => modelOf(curve)?.warning ?? checkpointOf(curve), "checkpoints")];
   return svgFigure(page.figure, scored, { titles, threshold: Number(page.threshold.value) });
 }
 
@@ -492,8 +494,12 @@ function howMany() {
 }
 
 /** The checkpoint that answers a question. */
-function checkpointOf({ model }) {
-  return gateway.models.find(({ name }) => name === model)?.source ?? model;
+function checkpointOf(curve) {
+  return modelOf(curve)?.source ?? curve.model;
+}
+
+function modelOf({ model }) {
+  return gateway.models.find(({ name }) => name === model);
 }
 
 /** The settings belong to the tabs that have some, and what is said of curves to the first. */
