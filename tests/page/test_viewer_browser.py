@@ -167,6 +167,13 @@ def test_the_page_shows_frames_corrected_as_the_model_gets_them(page: Page) -> N
         assert min(corrections, key=distance) == correction
 
 
+TURN = """
+const { left, width, top } = arguments[0].getBoundingClientRect();
+const place = { clientX: left + width / 2, clientY: top + 9, deltaY: arguments[1], ctrlKey: true };
+arguments[0].dispatchEvent(new WheelEvent("wheel", place));
+"""  # the wheel, with Ctrl
+
+
 def test_the_pointer_the_keys_and_the_button_move_the_videos_and_the_numbers(page: Page) -> None:
     page.score("success", "failure")
     (over,) = page.browser.all(".u-over")
@@ -176,6 +183,12 @@ def test_the_pointer_the_keys_and_the_button_move_the_videos_and_the_numbers(pag
     ActionChains(page.browser.driver).move_to_element_with_offset(over, -width // 4, 0).click_and_hold().perform()
     wait_for(lambda: page.is_at(1.5 / 4, 0.02))
     ActionChains(page.browser.driver).move_by_offset(width // 2, 0).release().perform()
+    wait_for(lambda: page.is_at(1.5 * 3 / 4, 0.02))
+    page.browser.run(TURN, over, -200)  # half of the time is shown, from 0.25 on
+    ActionChains(page.browser.driver).move_to_element_with_offset(over, -width // 4, 0).perform()
+    wait_for(lambda: page.is_at(1.5 * 3 / 8, 0.02))
+    ActionChains(page.browser.driver).move_to_element(over).double_click().perform()
+    ActionChains(page.browser.driver).move_to_element_with_offset(over, width // 4, 0).perform()
     wait_for(lambda: page.is_at(1.5 * 3 / 4, 0.02))
     expected = [video[name][11] for name in SIGNALS for video in page.saved()["videos"]]
     assert page.beside_the_lines() == pytest.approx(expected, abs=SHOWN)
@@ -219,7 +232,7 @@ def test_several_videos_are_ranked_as_by_the_command_line(page: Page) -> None:
     answer, told = compared(page, "success", "failure", "nothing")
     best_first = sorted(told["videos"], key=lambda video: -video["wins"])
     assert page.browser.run("return [...document.querySelectorAll('#pairs li')].map((item) => item.textContent)") == [
-        f"{video['rank'] or '?'}. {video['source']}P(wins) = {video['wins']:.3f}" for video in best_first
+        f"{video['rank'] or '?'} {video['source']}P(wins) = {video['wins']:.3f}" for video in best_first
     ]
     widths = page.browser.run(
         "return [...document.querySelectorAll('#pairs .share')].map((bar) => bar.firstChild.offsetWidth / bar.offsetWidth)"

@@ -454,8 +454,9 @@ def test_each_tab_opened_fresh_on_a_phone_shows_its_content_and_no_settings(page
         assert not browser["shelf"].is_displayed()
         browser.draw()
         assert browser.run(IN_VIEW, ["episodes-title"])[0] > 0
+        assert browser["order-told"].text == "No success, then most backward steps, then differing cameras"
         rows = browser.run("return document.getElementById('episodes').getBoundingClientRect()")
-        assert rows["top"] < size[1] / 2 + 20
+        assert rows["top"] + 2 * 104 < size[1]
         assert rows["height"] == 10 * 104
         assert browser.run(UNSEEN, "#episodes th button, #episodes .task", "tr") == []
         page.open_link("")

@@ -13,7 +13,7 @@ export function sentenceOf({ videos, answer }) {
   const best = answer.videos.findIndex(({ rank }) => rank === 1);
   if (answer.pairs.every(({ verdict }) => verdict)) return `${videos[best].title} does the task ${videos.length > 2 ? "best" : "better"}.`;
   const [{ orders_agree: agree }, ...others] = answer.pairs;
-  if (others.length) return "No whole ranking: some answers change with the order, or are exactly 0.5.";
+  if (others.length) return `${best < 0 ? "No ranking" : `${videos[best].title} does the task best, but the others have no rank`}: some answers change with the order.`;
   return agree ? "No verdict: both answers are exactly 0.5." : "No verdict: the answer changes with the order.";
 }
 
@@ -41,7 +41,7 @@ function rankingOf(videos, answer) {
     share.style.width = `${100 * wins}%`;
     share.style.background = video.colour ?? `var(--${colourName(video.place)})`;
     bar.append(share);
-    item.append(element("span", `${rank ?? "?"}. ${video.title}`), bar, element("span", `P(wins) = ${shown(wins)}`));
+    item.append(element("span", `${rank ?? "?"} ${video.title}`), bar, element("span", `P(wins) = ${shown(wins)}`));
     list.append(item);
   }
   return list;
