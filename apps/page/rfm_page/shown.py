@@ -133,6 +133,7 @@ class ShownDataset:
             "labels": None if file is None else self._name_of(file),
             "cameras": list(self.cameras),
             "has_stored_pixels": self.has_stored_pixels,
+            "is_on_hub": self.dataset.revision is not None,
             "unused": [unused.get(camera) for camera in self.cameras],
             "left_out": dict(self.dataset.left_out),
             "corrections": [asdict(self._correction(file, camera)) for camera in self.cameras],

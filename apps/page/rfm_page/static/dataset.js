@@ -481,9 +481,11 @@ export class DatasetTab {
 
   /** Lets the server download what it lacks of an episode on the Hub, and says how much; asks before a large download. */
   async #download(episode, signal) {
+    if (!this.#told.is_on_hub) return;
     const place = this.#places.episode;
     const { size, asks } = await missingOf(this.#number, episode, signal);
     if (size === null || signal.aborted) return;
+    this.#timeline.show([]);
     if (asks) await new Promise((accept) => place.show(downloading(episode, size, accept)));
     if (signal.aborted) return;
     place.show(downloading(episode, size));
