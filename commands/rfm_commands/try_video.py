@@ -16,6 +16,7 @@ from rfm_client import RewardClient, Trajectory
 from rfm_client.cli.command import OptionValues, with_options
 from rfm_client.cli.options import FrameRate
 from rfm_client.cli.show import PAGE_PORT, PAGE_URL, command, next_steps, scores_table
+from rfm_client.contract.description import TOY
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.contract.wire import frames_name
 from rfm_commands.command import TritonPath, fail
@@ -83,10 +84,13 @@ def score_video(endpoints: Endpoints, video: Path, frames: UInt8Array, task: str
     with RewardClient(endpoints.grpc_url) as client:
         trajectory = Trajectory(frames=frames, task=task)
         result = client.progress(trajectory, subsample=True)
-        title = heading(task, [checkpoint_of(client, trajectory)])
+        checkpoint = checkpoint_of(client, trajectory)
     if len(result.progress) < len(frames):
         typer.echo(f"{video.name}: {len(result.progress)} of {len(frames)} frames, evenly, are scored")
     print(scores_table(f'"{task}"', [(video.name, result)]))
+    if checkpoint == TOY:
+        typer.echo(f"note: {TOY}")
+    title = heading(task, [checkpoint])
     plot(picture, [Panel.of(video.name, result, frames, frame_times_s(video, len(frames)))], title)
     typer.echo(f"The curves are in {picture}.")
 

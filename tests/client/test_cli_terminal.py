@@ -26,6 +26,7 @@ from rfm_client.cli.options import SyntheticSamples
 from rfm_client.cli.scoring import unique_stems
 from rfm_client.cli.show import status_tables
 from rfm_client.command_line import ExitCode, number
+from rfm_client.contract.description import TOY
 from rfm_client.contract.wire import encode_samples
 from rfm_client.serving import ServerStatus
 from rfm_client.transport.status import ModelStatus
@@ -60,6 +61,15 @@ def test_status_fits_a_terminal(demo_server: Endpoints) -> None:
     words, _ = shown(url, "status", "--metrics-url", demo_server.metrics_url)
     heads = {"model", "v", "state", "requests", "failed", "refused", "pending", "batches", "samples", "queue", "ms"}
     assert heads | {"rfm", "rfm_encoder", "rfm_frames"} <= words
+
+
+def test_scores_and_figures_of_the_toy_checkpoint_say_that_they_mean_nothing(
+    demo_server: Endpoints, video: Path, tmp_path: Path
+) -> None:
+    words = ("--url", demo_server.grpc_url, "--task", TASK, "--plot", tmp_path / "plot.svg")
+    result = invoke("score", video, *words)
+    assert (result.exit_code, result.stderr.count(f"note: {TOY}")) == (0, 1)
+    assert TOY in (tmp_path / "plot.svg").read_text()
 
 
 def test_scores_and_comparisons_fit_a_terminal_and_name_each_file(engines: EngineServer, videos: list[Path]) -> None:

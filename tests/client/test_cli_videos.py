@@ -278,9 +278,11 @@ def test_a_comparison_names_no_winner_where_the_orders_disagree(
     scores = ProgressResult(progress=np.zeros(2, np.float32), success=np.zeros(2, np.float32))
     seen = random_trajectory(0, 2, *WIDTHS)
     comparison = Comparison(
-        [Source(f"{index}.npz", seen, None) for index in range(len(ranks))],
-        [scores] * len(ranks),
-        {order: PreferenceResult(preference=each, first=scores, second=scores) for order, each in preferences.items()},
+        sources=[Source(f"{index}.npz", seen, None) for index in range(len(ranks))],
+        scores=[scores] * len(ranks),
+        results={
+            order: PreferenceResult(preference=each, first=scores, second=scores) for order, each in preferences.items()
+        },
     )
     assert (comparison.ranks, comparison.ranking) == (ranks, ranking)
     of_videos, of_pairs, *legend = comparison.tables()

@@ -462,10 +462,8 @@ def test_only_the_files_of_the_chosen_episodes_and_cameras_are_downloaded(
     texts, few = EpisodeTexts(), LabelOptions(output=tmp_path / "out", episodes=[3], cameras=[WRIST], frames=4)
     command = LabelCommand(address, texts, few, RunOptions(), RayOptions(), lambda: nullcontext(engine), notes.append)
     with local_hub.hub({HUB_ID: {"main": source}}, "datasets") as endpoint, local_hub.asked(endpoint, tmp_path / "hub"):
-        monkeypatch.setattr("rfm_labels.commands.label.ASK_BYTES", 10)
-        with pytest.raises(
-            ConfigError, match=r"^yes: expected --yes for more than 1e-08 GB, got none for 0\.0\d GB in 2 "
-        ):
+        monkeypatch.setattr("rfm_labels.datasets.hub.ASK_BYTES", 10)
+        with pytest.raises(ConfigError, match=r"^yes: expected --yes for more than 10 GB, got none for 0\.\d MB in 2 "):
             command.run()
         monkeypatch.undo()
         assert command.run() == 0
@@ -474,7 +472,7 @@ def test_only_the_files_of_the_chosen_episodes_and_cameras_are_downloaded(
         needed = ["data/chunk-000/episode_000003.parquet", f"videos/chunk-000/{WRIST}/episode_000003.mp4"]
         assert sorted(name for name in here if not name.startswith("meta/")) == needed
         assert replace(command, options=RunOptions(dry_run=True)).run() == 0  # all is here: no download
-        assert [line.split(" GB")[1] for line in notes if "downloading" in line] == [
+        assert [line.split(" MB")[1] for line in notes if "downloading" in line] == [
             " in 2 files, all that the chosen episodes and cameras need"
         ] * 2
         dataset = open_dataset(f"https://huggingface.co/datasets/{HUB_ID}/tree/main")

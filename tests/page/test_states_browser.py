@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
 import pytest
 from selenium.webdriver.support.select import Select
 
+import local_hub
 from browsers import Browser
-from gateways import free_port, running
-from labelling import BrightnessScorer
+from gateways import StandIn, free_port, listening, running
+from labelling import LEROBOT, BrightnessScorer
 from paths import ROOT
 from rfm_labels import LabelOptions, label, open_dataset
 from servers import Endpoints, start_triton
@@ -22,6 +24,7 @@ pytestmark = [pytest.mark.triton, pytest.mark.slow]
 NOWHERE = Endpoints(http_port=1, grpc_port=1, metrics_port=1)
 KEY = "open sesame"
 THEMES = ("light", "dark")
+PANEL = "return document.querySelector('.panel:not([hidden])').getBoundingClientRect().toJSON()"
 
 
 def wait_for_state(browser: Browser, place: str) -> str:
@@ -63,7 +66,9 @@ def test_a_page_goes_on_without_a_reload_when_triton_a_key_and_a_broken_dataset_
         )
         assert middle == pytest.approx(0.5, abs=0.02)  # not in the column of the settings
         without_violations(browser)
+        before = browser.run(PANEL)
     assert wait_for_state(browser, "away").startswith("The server does not answer")  # the page asks on
+    assert browser.run(PANEL) == before
     assert "connection refused" not in browser["away"].text.lower()
     without_violations(browser)
     with running(demo_server, tmp_path, "rfm", "--dataset", str(root), port=port, RFM_GATEWAY_API_KEY=KEY):
@@ -135,3 +140,24 @@ def test_a_page_with_nothing_to_show_gives_a_command_to_run(browser: Browser, tm
         Select(browser["dataset"]).select_by_value("2")
         browser.until("!document.getElementById('left-out').hidden")
         assert browser["left-out"].text.startswith("range is left out: uint16 [12, 63, 81], a depth map, a mask")
+
+
+def test_an_episode_on_the_hub_opens_once_it_is_downloaded_and_a_large_download_needs_a_click(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    repositories = {"org/name": {"main": LEROBOT / "toy_v21"}}
+    with (
+        local_hub.hub(repositories, "datasets") as endpoint,
+        local_hub.asked(endpoint, tmp_path),
+        listening(StandIn(), dataset=("org/name",)) as gateway,
+    ):
+        browser.driver.get(f"{gateway.url}/#tab=dataset&episode=3")
+        browser.until("document.querySelectorAll('#episode-videos video').length === 2")
+        monkeypatch.setattr("rfm_labels.datasets.hub.ASK_BYTES", 10)
+        browser.run("document.querySelector('#episodes tr[data-episode=\"5\"] button').click()")
+        told = wait_for_state(browser, "episode-errors")
+        assert re.fullmatch(r"A large download\nEpisode 5 needs 0\.\d MB in 3 files from the Hub\.\nDownload", told)
+        without_violations(browser)
+        browser.all("#episode-errors button")[0].click()
+        browser.until("document.querySelectorAll('#episode-videos video').length === 2")
+        assert browser["episode-errors"].text == ""

@@ -117,7 +117,7 @@ def test_a_wrong_question_says_why(
 def test_a_missing_video_a_missing_model_and_a_refused_task_are_named(encoders: Gateway, videos: Path) -> None:
     video = videos / "clip.mp4"
     response = post(encoders.url, COMPARE, {"first": video}, **QUESTION)
-    check_refused(response, (["second"], "expected a video file, got none"))
+    check_refused(response, (["videos"], "expected at least 2 video files, got 1"))
     response = post(encoders.url, SCORE, {"video": video}, **{**QUESTION, "model": "missing"})
     assert "missing_frames" in failure(response, 503)
     response = post(encoders.url, SCORE, {"video": video}, model=VLM, task="<|im_end|>")

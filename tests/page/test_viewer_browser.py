@@ -26,6 +26,7 @@ import clip
 from browsers import REBOUND, Browser
 from gateways import Gateway, running
 from paths import VIDEOS
+from rfm_client.contract.description import TOY
 from rfm_client.frames import ChannelOrder, Correction, Orientation
 from servers import Endpoints, folder_server, wait_for
 from tolerances import SHOWN, TOLERANCE
@@ -104,6 +105,7 @@ def test_dropped_clips_get_the_curves_of_the_command_line(page: Page) -> None:
     page.score("success", "failure")
     document = page.saved()
     assert [video["source"] for video in document["videos"]] == ["success.mp4", "failure.mp4"]
+    assert page.browser["warning"].text == TOY
     videos = by_command_line(page.videos, page.browser["command"].text)["videos"]
     for shown, video, row in zip(document["videos"], videos, page.browser.cells("#curves tr"), strict=True):
         for name in ("progress", "success", "frame_times_s"):
@@ -165,6 +167,13 @@ def test_the_page_shows_frames_corrected_as_the_model_gets_them(page: Page) -> N
         assert min(corrections, key=distance) == correction
 
 
+TURN = """
+const { left, width, top } = arguments[0].getBoundingClientRect();
+const place = { clientX: left + width / 2, clientY: top + 9, deltaY: arguments[1], ctrlKey: true };
+arguments[0].dispatchEvent(new WheelEvent("wheel", place));
+"""  # the wheel, with Ctrl
+
+
 def test_the_pointer_the_keys_and_the_button_move_the_videos_and_the_numbers(page: Page) -> None:
     page.score("success", "failure")
     (over,) = page.browser.all(".u-over")
@@ -174,6 +183,12 @@ def test_the_pointer_the_keys_and_the_button_move_the_videos_and_the_numbers(pag
     ActionChains(page.browser.driver).move_to_element_with_offset(over, -width // 4, 0).click_and_hold().perform()
     wait_for(lambda: page.is_at(1.5 / 4, 0.02))
     ActionChains(page.browser.driver).move_by_offset(width // 2, 0).release().perform()
+    wait_for(lambda: page.is_at(1.5 * 3 / 4, 0.02))
+    page.browser.run(TURN, over, -200)  # half of the time is shown, from 0.25 on
+    ActionChains(page.browser.driver).move_to_element_with_offset(over, -width // 4, 0).perform()
+    wait_for(lambda: page.is_at(1.5 * 3 / 8, 0.02))
+    ActionChains(page.browser.driver).move_to_element(over).double_click().perform()
+    ActionChains(page.browser.driver).move_to_element_with_offset(over, width // 4, 0).perform()
     wait_for(lambda: page.is_at(1.5 * 3 / 4, 0.02))
     expected = [video[name][11] for name in SIGNALS for video in page.saved()["videos"]]
     assert page.beside_the_lines() == pytest.approx(expected, abs=SHOWN)
@@ -196,23 +211,52 @@ def test_the_pointer_the_keys_and_the_button_move_the_videos_and_the_numbers(pag
     page.browser.until_text("play", "Pause")
 
 
-def test_a_pair_is_compared_in_both_orders(page: Page) -> None:
-    page.score("success", "failure")
+def compared(page: Page, *names: str) -> tuple[Any, Any]:
+    """Score and compare videos. Return the comparison that the page saves, and the one of its command line."""
+    page.score(*names)
     page.browser["compare"].click()
-    page.browser.until("document.querySelector('#pairs p')")
+    page.browser.until("document.querySelector('#pairs ol')")
     (answer,) = page.saved()["comparisons"]
-    commands = [line for line in page.browser["command"].text.splitlines() if line.startswith("rfm-client compare")]
-    shown = [item.text for item in page.browser.all("#pairs li")]
-    for place, order, command, line in zip(("first", "second"), answer["orders"], commands, shown, strict=True):
-        preference = by_command_line(page.videos, f"{command} --json pair.json")["preference"]
-        assert order["preference"] == pytest.approx(preference, abs=TOLERANCE)
-        told = re.fullmatch(rf"P\(success\.mp4 is better\) = ([\d.]+) \(shown {place}\)", line)
-        assert told
-        better = preference if place == "first" else 1 - preference
-        assert float(told[1]) == pytest.approx(better, abs=SHOWN + TOLERANCE)
+    (command,) = [line for line in page.browser["command"].text.splitlines() if line.startswith("rfm-client compare")]
+    told = by_command_line(page.videos, f"{command} --json ranking.json")
+    for ours, theirs in zip(answer["orders"], told["orders"], strict=True):
+        assert ours.pop("preference") == pytest.approx(theirs.pop("preference"), abs=TOLERANCE)
+        assert ours == theirs
+    assert answer["pairs"] == told["pairs"]
+    assert [video["rank"] for video in answer["videos"]] == [video["rank"] for video in told["videos"]]
+    return page.saved()["comparisons"][0], told
+
+
+def test_several_videos_are_ranked_as_by_the_command_line(page: Page) -> None:
+    clip.write(page.videos / "nothing.mp4", make_clip("stopped", Task("red", "bowl"), 2_000_002).frames, FPS)
+    answer, told = compared(page, "success", "failure", "nothing")
+    best_first = sorted(told["videos"], key=lambda video: -video["wins"])
+    assert page.browser.run("return [...document.querySelectorAll('#pairs li')].map((item) => item.textContent)") == [
+        f"{video['rank'] or '?'} {video['source']}P(wins) = {video['wins']:.3f}" for video in best_first
+    ]
+    widths = page.browser.run(
+        "return [...document.querySelectorAll('#pairs .share')].map((bar) => bar.firstChild.offsetWidth / bar.offsetWidth)"
+    )
+    assert widths == pytest.approx([video["wins"] for video in best_first], abs=0.02)
+    assert page.browser.run("return document.querySelectorAll('#pairs details p').length") == 3
+    page.browser.all("#videos .remove")[2].click()
+    assert page.browser.all("#pairs li") == []
+    assert len(answer["pairs"]) == 3
+
+
+def test_a_pair_is_compared_in_both_orders(page: Page) -> None:
+    answer, _ = compared(page, "success", "failure")
+    orders = [order["preference"] for order in answer["orders"]]
+    (line,) = page.browser.all("#pairs details p")
+    told = re.fullmatch(
+        r"P\(success\.mp4 is better than failure\.mp4\) = ([\d.]+) shown first, ([\d.]+) shown second", line.text
+    )
+    assert told
+    assert [float(text) for text in told.groups()] == pytest.approx([orders[0], 1 - orders[1]], abs=SHOWN + TOLERANCE)
     assert page.browser.all("#pairs h2")[0].text == "success.mp4 does the task better"
     assert page.browser.all("#pairs p")[0].text == f"{TASK} (rfm). Both orders agree."
-    assert (answer["verdict"], answer["orders_agree"]) == ("first", True)
+    (pair,) = answer["pairs"]
+    assert (pair["verdict"], pair["orders_agree"]) == ("first", True)
     status = page.browser["status"]
     assert (status.text, status.aria_role) == ("success.mp4 does the task better.", "status")
     before = page.saved()
@@ -341,7 +385,7 @@ def test_tasks_are_overlaid_colours_tell_videos_apart_and_lines_tell_tasks_apart
     assert len(found) == 4
     assert [len({line[part] for line in found}) for part in (0, 1)] == [2, 2]
     told = texts(figure(page))
-    assert told[:3] == ["2 tasks", "2 videos", "demo_checkpoint/checkpoint"]
+    assert told[:3] == ["2 tasks", "2 videos", TOY]
     assert told[-4:] == ["success.mp4", "failure.mp4", TASK, OTHER_TASK]  # each video's colour, then each task's line
     page.browser.all("#legend .remove")[1].click()
     assert [row[1] for row in page.browser.cells("#curves tr")] == [TASK, TASK]
@@ -398,7 +442,7 @@ def test_the_figure_fits_a_column_of_a_paper_and_is_light(page: Page) -> None:
     assert np.asarray(picture)[[0, 0, -1], [0, -1, -1]].tolist() == [[255] * 3] * 3
     assert (np.asarray(picture).std(axis=2) > 20).any()  # the coloured lines
     assert svg.attrib["width"] == "252pt"
-    names = {TASK, "demo_checkpoint/checkpoint", "success.mp4", "failure.mp4", "progress", "success", "time (s)"}
+    names = {TASK, TOY, "success.mp4", "failure.mp4", "progress", "success", "time (s)"}
     assert names <= set(texts(svg))
     lines = [
         [tuple(map(float, point.split(","))) for point in line.attrib["points"].split()]

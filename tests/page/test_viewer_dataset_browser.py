@@ -437,6 +437,45 @@ def test_the_tabs_fit_into_the_window_and_break_no_rule_of_axe_in_either_theme(
             assert min(page.browser.run(HEIGHTS)) >= 96
 
 
+UNSEEN = """
+return [...document.querySelectorAll(arguments[0])].filter((name) => {
+  const [{ top, bottom, left, right }, box] = [name, name.closest(arguments[1])].map((each) => each.getBoundingClientRect());
+  return !(right > left && top >= box.top - 1 && bottom <= box.bottom + 1 && right <= Math.min(box.right, innerWidth) + 1);
+}).map((name) => name.textContent);
+"""  # names that their boxes clip, or the window
+
+
+@pytest.mark.parametrize("size", [(390, 844), (430, 932), (600, 900)], ids=str)
+def test_each_tab_opened_fresh_on_a_phone_shows_its_content_and_no_settings(page: Page, size: tuple[int, int]) -> None:
+    browser = page.browser
+    with browser.window(*size):
+        page.open_link(FIRST)
+        browser.until("document.querySelectorAll('#episodes tr').length === 10")
+        assert not browser["shelf"].is_displayed()
+        browser.draw()
+        assert browser.run(IN_VIEW, ["episodes-title"])[0] > 0
+        assert browser["order-told"].text == "No success, then most backward steps, then differing cameras"
+        rows = browser.run("return document.getElementById('episodes').getBoundingClientRect()")
+        assert rows["top"] + 2 * 104 < size[1]
+        assert rows["height"] == 10 * 104
+        assert browser.run(UNSEEN, "#episodes th button, #episodes .task", "tr") == []
+        page.open_link("")
+        browser.until("document.getElementById('model').value")
+        assert not browser["question"].is_displayed()
+        browser["fold"].click()
+        browser.write("tasks", "put the red block in the bowl")
+        browser.all("#examples > button")[0].click()
+        browser.until_text("scored", "3 of 3 scored")
+        assert not browser["question"].is_displayed()  # it makes way for the curves
+        browser.draw()
+        assert browser.run(UNSEEN, "#videos .nameable button", "figcaption") == []
+        assert browser.run(IN_VIEW, ["videos"])[0] > 0
+        assert browser["time-told"].text == "5.00 / 5.00 s"
+        page.open_link("")
+        browser.until("document.getElementById('model').value")
+        assert not browser["question"].is_displayed()
+
+
 FIRST, SECOND = "#tab=dataset&dataset=toy_v30_many", "#tab=dataset&dataset=toy_v21%7E2"  # the second of one name
 
 

@@ -23,7 +23,9 @@ import pytest
 from PIL import Image
 from pyarrow import parquet
 
+import clip
 import hdf5_writers as writers
+import local_hub
 from gateway_requests import failure
 from gateways import inside
 from labelling import LEROBOT, BrightnessScorer
@@ -97,20 +99,24 @@ def test_the_table_and_the_curves_are_those_of_the_labels(get: Get, folders: lis
         np.testing.assert_array_equal(curves, [columns[name] for name in pair])
 
 
-def test_a_preview_has_the_first_frame_as_for_the_labels_and_a_few_points(get: Get, folders: list[Path]) -> None:
-    preview = get(f"/{V21}/episodes/1/preview").json()
-    labels = columns_of(folders[V21], 1)["progress_sparse"]
-    assert len(labels) <= 32
-    assert preview["progress"] == pytest.approx(labels.tolist(), abs=1e-6)
-    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(preview["picture"]))))
-    dataset = LeRobotDataset(folders[V21])
-    frame = next(dataset.stored_frames(dataset.episode(1), CAMERAS[0]))
-    expected = Image.fromarray(frame)
-    expected.thumbnail((96, 72))
-    assert np.abs(picture.astype(int) - np.asarray(expected)).mean() < 5
+def test_a_preview_has_the_first_and_the_last_frame_as_for_the_labels_and_a_few_points(
+    get: Get, folders: list[Path]
+) -> None:
+    for number in (V21, V30):
+        preview = get(f"/{number}/episodes/1/preview").json()
+        labels = columns_of(folders[number], 1)["progress_sparse"]
+        places = np.linspace(0, len(labels) - 1, min(32, len(labels))).round().astype(int)
+        assert preview["progress"] == pytest.approx(labels[places].tolist(), abs=1e-6)
+        dataset = LeRobotDataset(folders[number])
+        frames = list(dataset.stored_frames(dataset.episode(1), CAMERAS[0]))
+        for stored, end in zip(preview["pictures"], (frames[0], frames[-1]), strict=True):
+            picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(stored))))
+            expected = Image.fromarray(end)
+            expected.thumbnail((96, 72))
+            assert np.abs(picture.astype(int) - np.asarray(expected)).mean() < 5
     plain = get("/2/episodes/1/preview").json()
     assert plain["progress"] == []
-    assert plain["picture"]
+    assert plain["pictures"]
     assert "expected one from 0 to" in failure(get("/0/episodes/99/preview"), 404)
 
 
@@ -158,10 +164,24 @@ def episodes(folder):
     return f"{folder}/my_reader.py:episodes={folder}"
 
 
-@pytest.mark.parametrize("make", [rlds, with_pictures_in_tables, hdf5, by_pattern, by_reader])
+def folder_of_videos(folder: Path) -> Path:
+    (folder / "videos").mkdir()
+    for number in range(2):
+        clip.write(folder / "videos" / f"{number}.mp4", writers.video(4, seed=number), 5)
+    return folder / "videos"
+
+
+def folder_of_hdf5(folder: Path) -> Path:
+    return hdf5(folder).parent
+
+
+@pytest.mark.parametrize(
+    "make", [rlds, with_pictures_in_tables, hdf5, folder_of_hdf5, folder_of_videos, by_pattern, by_reader]
+)
 def test_pictures_are_shown_as_a_video(tmp_path: Path, make: Callable[[Path], Path | str]) -> None:
     root = make(tmp_path)
-    dataset = open_to_show(str(root))
+    (dataset,) = open_to_show(str(root))
+    fps = 5 if make is folder_of_videos else 10
     number, camera = dataset.numbers[1], len(dataset.cameras) - 1
     with serving(root) as get:
         table, curves = get("/0").json(), get(f"/0/episodes/{number}").json()
@@ -172,10 +192,10 @@ def test_pictures_are_shown_as_a_video(tmp_path: Path, make: Callable[[Path], Pa
     assert [row["task"] for row in table["episodes"]] == [episode.task for episode in dataset.episodes]
     assert (curves["curves"], faults) == ([], {})
     expected = np.stack(list(dataset.frames(dataset.episode(number), dataset.cameras[camera])))
-    assert curves["times_s"] == pytest.approx(np.arange(len(expected)) / 10)
+    assert curves["times_s"] == pytest.approx(np.arange(len(expected)) / fps)
     with av.open(io.BytesIO(video.content)) as container:
         frames = [(float(frame.time or 0), frame.to_ndarray(format="rgb24")) for frame in container.decode(video=0)]
-    assert [time_s for time_s, _ in frames] == pytest.approx(np.arange(len(expected)) / 10, abs=1e-3)
+    assert [time_s for time_s, _ in frames] == pytest.approx(np.arange(len(expected)) / fps, abs=1e-3)
     shown = np.stack([frame[: expected.shape[1], : expected.shape[2]] for _, frame in frames])
     assert np.abs(shown.astype(int) - expected).mean() < 4  # colours at half the resolution
 
@@ -220,6 +240,55 @@ def test_a_cut_is_exact_however_the_video_is_coded(tmp_path: Path, coding: tuple
     with serving(root) as get:
         for episode in OF_VIDEO:
             check_frames(get, root, episode)
+
+
+HUB_ID = "org/name"
+ADDRESSES = (HUB_ID, f"hf://datasets/{HUB_ID}", f"https://huggingface.co/datasets/{HUB_ID}")
+
+
+def test_of_a_dataset_on_the_hub_only_the_watched_episode_is_downloaded_after_its_size_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, path = LEROBOT / "toy_v21", "/0/episodes/3"
+    with (
+        local_hub.hub({HUB_ID: {"main": source}}, "datasets") as endpoint,
+        local_hub.asked(endpoint, tmp_path / "hub"),
+        inside(dataset=ADDRESSES) as gateway,
+    ):
+        told = gateway.get("/viewer/datasets").json()["datasets"]
+        assert told == [{"name": HUB_ID, "kind": "LeRobot v2.1", "labels": []}] * len(ADDRESSES)
+        (snapshot,) = (tmp_path / "hub").glob("*/snapshots/*")
+
+        def here() -> list[str]:
+            files = (str(file.relative_to(snapshot)) for file in snapshot.rglob("*") if file.is_file())
+            return sorted(name for name in files if not name.startswith("meta/"))
+
+        def get(path: str) -> Any:
+            return gateway.get(f"/viewer/datasets{path}")
+
+        names = ("episode", "task", "num_frames")
+        assert [[row[name] for name in names] for row in get("/0").json()["episodes"]] == [
+            [each.index, each.task, each.num_frames] for each in LeRobotDataset(source).episodes
+        ]
+        assert (get("/0/faults").json(), get(f"{path}/preview").json()["pictures"]) == ({}, [])
+        assert here() == []
+        needed = [
+            "data/chunk-000/episode_000003.parquet",
+            *(f"videos/chunk-000/{camera}/episode_000003.mp4" for camera in CAMERAS),
+        ]
+        size = f"{sum((source / name).stat().st_size for name in needed) / 1e6:.1f} MB in 3 files"
+        assert get(f"{path}/missing").json() == {"size": size, "asks": False}
+        monkeypatch.setattr("rfm_labels.datasets.hub.ASK_BYTES", 10)
+        assert get(f"{path}/missing").json()["asks"] is True
+        assert here() == []
+        all_here = {"size": None, "asks": False}
+        assert gateway.post(f"/viewer/datasets{path}/missing").json() == all_here
+        assert here() == needed
+        check_frames(get, source, 3)
+        assert len(get(f"{path}/preview").json()["pictures"]) == 2
+        assert here() == needed
+    with serving(source) as get:
+        assert get(f"{path}/missing").json() == all_here
 
 
 def test_an_episode_that_needs_frames_behind_its_end_is_refused(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from rfm import published
 from rfm.config import ExportConfig
 from rfm.engine import Engine, Outcome
 from rfm_client import PreferenceSample, ProgressResult, ProgressSample, Sample, Trajectory
+from rfm_client.contract.description import TOY
 from toy_world import TASKS, make_clip
 
 REPOSITORY = ROOT / "model_repository"
@@ -97,7 +98,7 @@ def test_a_checkpoint_of_one_s_own_scores_a_video(tmp_path: Path, monkeypatch: p
         result = rfm("try", tmp_path / "clip.mp4", *(word for pair in options.items() for word in pair))
     assert result.exit_code == 0, result.output
     exported = f"rfm export --checkpoint {checkpoint} --image-encoder {encoders / 'image_encoder'}"
-    for shown in (clip.TASK, "clip.mp4", "32 frames", exported, "rfm serve my_models --gateway-port 8100"):
+    for shown in (TOY, clip.TASK, "clip.mp4", "32 frames", exported, "rfm serve my_models --gateway-port 8100"):
         assert shown in result.output
     assert (tmp_path / "rewards.png").read_bytes().startswith(PNG)
 

@@ -46,7 +46,7 @@ class GatewayConfig(Settings):
     model: str | None = setting(None, "Model name in the repository. Default: rfm, or export.name.")
     viewer: bool = setting(True, "Serve the page in the browser, at /.")
     dataset: tuple[str, ...] = setting(
-        (), "Dataset to show on the page: a path, PATTERN=FOLDER or READER=FOLDER. Repeat for more."
+        (), "Dataset to show on the page: a path, a Hub id, PATTERN=FOLDER or READER=FOLDER. Repeat for more."
     )
     api_key_file: Path | None = setting(None, f"File with the API key that requests need. Default: {KEY_VARIABLE}.")
     cors_origin: tuple[str, ...] = setting((), "Web origin that may send requests. Repeat for more.")

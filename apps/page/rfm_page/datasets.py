@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import av
-import numpy as np
-import numpy.typing as npt
 
+from rfm_client import UInt8Array
 from rfm_client.frames import FrameFileError, Video
 from rfm_labels import DatasetEpisode, DatasetError, find_label_files
 from rfm_labels.datasets import Hdf5Dataset, LeRobotDataset, Span, opened_hdf5
@@ -32,6 +31,11 @@ class ShownLeRobot(ShownDataset):
     dataset: LeRobotDataset
 
     @property
+    def bounds(self) -> Path:
+        """The folder; in the Hub's cache that of the repository, to whose blobs a commit's files are links."""
+        return self.root if self.dataset.revision is None else self.root.parents[1].resolve()
+
+    @property
     def has_stored_pixels(self) -> bool:
         """True if all cameras have videos."""
         return not self.dataset.info.images
@@ -42,14 +46,12 @@ class ShownLeRobot(ShownDataset):
         unused, videos = self.dataset.unused_cameras(self.dataset.cameras), self.dataset.info.videos
         return [camera for camera in self.dataset.cameras if camera in videos or camera not in unused]
 
-    @property
-    def fps(self) -> float:
-        """Frames per second, from ``meta/info.json``."""
-        return self.dataset.info.fps
-
-    def times_s(self, episode: DatasetEpisode) -> npt.NDArray[np.float64]:
-        """Return float64 [T], the times in the episode's rows. Raises DatasetError."""
-        return self.dataset.times_s(episode)
+    def ends(self, episode: DatasetEpisode, camera: str) -> list[UInt8Array]:
+        """Return the first and the last frame of the stored video, or the first picture. Raises DatasetError."""
+        if camera not in self.dataset.info.videos:
+            return super().ends(episode, camera)
+        span = self.dataset.span(episode, camera)
+        return [frame for t in (0, -1) for frame in replace(span, times_s=span.times_s[[t]]).frames()]
 
     def mp4(self, episode: DatasetEpisode, camera: str, take: Callable[[int], object]) -> bytes:
         """Return the episode's part of the stored video, or its pictures as a video. Raises DatasetError."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -53,8 +54,7 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
         raise ConfigError.at("dataset", expected, "none: pip install ./apps/labels") from None
     datasets: list[ShownDataset] = []
     try:
-        for path in config.dataset:
-            dataset = open_to_show(path)
+        for dataset in chain.from_iterable(map(open_to_show, config.dataset)):
             if isinstance(dataset, LeRobotDataset):
                 datasets.append(ShownLeRobot(dataset))
             elif isinstance(dataset, Hdf5Dataset):
@@ -70,17 +70,20 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
 def dataset_routes(datasets: Sequence[ShownDataset], limits: BodyLimits) -> APIRouter:
     """Return the endpoints for the page's datasets. The evaluation server has no such endpoints."""
     router = APIRouter(include_in_schema=False)
+    downloading = asyncio.Lock()  # one at a time, since each holds a thread
 
-    async def read(request: Request, number: int, reading: Callable[[ShownDataset], Read]) -> Read:
+    async def read(
+        request: Request, number: int, reading: Callable[[ShownDataset], Read], up_to_s: float | None = limits.timeout_s
+    ) -> Read:
         """Check a dataset and read from it, in a thread, and return the result.
 
         Raises HTTPException 404 for a missing part, 500 for a broken dataset, 504 if reading takes too long.
         """
         if not 0 <= number < len(datasets):
             raise HTTPException(404, f"dataset: expected one of {len(datasets)}, got {number}")
-        with anyio.move_on_after(limits.timeout_s):
+        with anyio.move_on_after(up_to_s):
             return await while_connected(request, asyncio.to_thread(datasets[number].read, reading))
-        raise HTTPException(504, f"dataset: expected an answer within {limits.timeout_s:g} s, got none")
+        raise HTTPException(504, f"dataset: expected an answer within {up_to_s:g} s, got none")
 
     @router.get("/viewer/datasets")
     async def names() -> Response:
@@ -98,6 +101,15 @@ def dataset_routes(datasets: Sequence[ShownDataset], limits: BodyLimits) -> APIR
     @router.get("/viewer/datasets/{dataset}/episodes/{episode}")
     async def curves(request: Request, dataset: int, episode: int, labels: str | None = None) -> Response:
         return _json(await read(request, dataset, lambda shown: shown.curves(episode, labels)))
+
+    @router.get("/viewer/datasets/{dataset}/episodes/{episode}/missing")
+    async def missing(request: Request, dataset: int, episode: int) -> Response:
+        return _json(await read(request, dataset, lambda shown: shown.missing(episode)))
+
+    @router.post("/viewer/datasets/{dataset}/episodes/{episode}/missing")
+    async def download(request: Request, dataset: int, episode: int) -> Response:
+        async with downloading:
+            return _json(await read(request, dataset, lambda shown: shown.download(episode), up_to_s=None))
 
     @router.get("/viewer/datasets/{dataset}/episodes/{episode}/preview")
     async def preview(request: Request, dataset: int, episode: int, labels: str | None = None) -> Response:

@@ -33,6 +33,7 @@ from rfm_client import (
     PreferenceResult,
     ProgressResult,
     ProgressSample,
+    Ranking,
     RewardError,
     ServerError,
     Trajectory,
@@ -42,6 +43,7 @@ from rfm_client.serving import off_loop
 from rfm_gateway.mounting import GatewayConfig, PageHost, invalid, while_connected
 from rfm_page.questions import DEFAULT_FPS, ShownVideo, VideoRequest
 
+MIN_COMPARED = 2  # videos
 MOST_PREFIXES = 32  # in a request
 MOST_BYTES = 64 * 2**20  # for all frames in a request
 STATUS_TIMEOUT_S = 5.0
@@ -96,14 +98,16 @@ def viewer_routes(host: PageHost) -> APIRouter:
 
     @router.post("/viewer/compare", dependencies=[host.place])
     async def compare(request: Request) -> Response:
-        asked = await read(request, "first", "second")
+        asked = await read(request)
+        if len(asked.videos) < MIN_COMPARED:
+            raise invalid(("videos",), f"expected at least {MIN_COMPARED} video files, got {len(asked.videos)}")
         async with config.client(asked.question.model) as client:
-            answer = await while_connected(request, _preferences(client, asked))
+            answer = await while_connected(request, _ranking(client, asked))
         metrics.samples.labels("preference").inc(len(answer["orders"]))
         return JSONResponse(answer)
 
     async def read(request: Request, *names: str) -> _Asked:
-        """Read a request with the videos under these names.
+        """Read a request with the videos under these names; without names, with all its videos.
 
         Raises RequestValidationError, HTTPException and RewardError.
         """
@@ -112,7 +116,7 @@ def viewer_routes(host: PageHost) -> APIRouter:
             async with config.client(question.model) as client:
                 info = await client.model_info(frames=True)
             sampling = question.sampling(info)
-            videos = await while_connected(request, decoded(question, uploads, names))
+            videos = await while_connected(request, decoded(question, uploads, names or tuple(uploads)))
         return _Asked(question, sampling, info, videos, request.state.request_id)
 
     async def decoded(
@@ -168,7 +172,7 @@ def _model_facts(name: str, info: ModelInfo) -> dict[str, Any]:
     rule = "all" if info.needs_whole_episode else usual
     about = {"name": name, "max_frames": info.max_frames, "rule": rule}
     about |= {"reads_views": info.reads_views, "has_success": info.has_success}
-    return {**about, "versions": list(info.versions), "source": info.source}
+    return {**about, "versions": list(info.versions), "source": info.source, "warning": info.warning}
 
 
 def _frames_of(rule: Rule) -> int | str | None:
@@ -217,24 +221,34 @@ def _points(first: int, parts: Sequence[ProgressResult]) -> dict[str, Any]:
     }
 
 
-async def _preferences(client: AsyncRewardClient, asked: _Asked) -> dict[str, Any]:
-    """Return the model's preference in both orders. Raises RewardError."""
-    first, second = (video.trajectory for video in asked.videos)
+async def _ranking(client: AsyncRewardClient, asked: _Asked) -> dict[str, Any]:
+    """Return the ranking of the videos, under the names that ``rfm-client compare --json`` uses. Raises RewardError.
+
+    ``first`` and ``second`` are the videos' indices.
+    """
+    trajectories = [video.trajectory for video in asked.videos]
     preferred = partial(client.preference, subsample=True, resize=asked.question.resize, request_id=asked.request_id)
+    results: dict[tuple[int, int], PreferenceResult] = {}
     try:
-        results = await asyncio.gather(preferred(first, second), preferred(second, first))
+        for couple in itertools.combinations(range(len(trajectories)), 2):  # few videos on the way at a time
+            orders = (couple, couple[::-1])
+            answers = await asyncio.gather(*(preferred(*map(trajectories.__getitem__, order)) for order in orders))
+            results |= zip(orders, answers, strict=True)
     except InvalidSampleError as error:
         raise invalid((error.where,), error.problem) from None
-    pair = PreferenceResult.of_both_orders(*results)
-    asked_orders = (("first", "second"), ("second", "first"))
+    ranking = Ranking(results=results)
+    pairs = [(*couple, ranking.pair(*couple)) for couple in ranking.couples()]
     return {
+        "model_version": ranking.model_version,
+        "videos": [{"wins": wins, "rank": rank} for wins, rank in zip(ranking.wins, ranking.ranks, strict=True)],
         "orders": [
-            {"asked": names, "preference": result.preference}
-            for names, result in zip(asked_orders, results, strict=True)
+            {"first": first, "second": second, "preference": result.preference}
+            for (first, second), result in sorted(results.items())
         ],
-        "verdict": pair.verdict,
-        "orders_agree": pair.orders_agree,
-        "model_version": pair.model_version,
+        "pairs": [
+            {"first": first, "second": second, "verdict": pair.verdict, "orders_agree": pair.orders_agree}
+            for first, second, pair in pairs
+        ],
     }
 
 

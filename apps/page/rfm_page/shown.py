@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import base64
 import io
+import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -66,9 +68,14 @@ class ShownDataset:
         """The folder or file."""
         return self.root
 
+    @property
+    def bounds(self) -> Path:
+        """The folder that the dataset's files must be in, with links resolved."""
+        return self.root
+
     def check(self) -> None:
         """Raise DatasetError if the dataset would show other files from this machine. Called before every read."""
-        check_links(self.root, links_in(self.root))
+        check_links(self.bounds, links_in(self.root))
 
     @property
     def has_stored_pixels(self) -> bool:
@@ -87,11 +94,15 @@ class ShownDataset:
 
     def times_s(self, episode: DatasetEpisode) -> npt.NDArray[np.float64]:
         """Return float64 [T], each frame's time; evenly spaced in a dataset without times."""
-        return np.arange(episode.num_frames) / self.fps
+        times_s = self.dataset.times_s(episode)
+        return np.arange(episode.num_frames) / self.fps if times_s is None else times_s
 
     def mp4(self, episode: DatasetEpisode, camera: str, take: Callable[[int], object]) -> bytes:
         """Return an episode's video as an MP4 file. take: see ``video``"""
-        return encoded(self.dataset.whole_frames(episode, camera), self.fps, take)
+        times_s, fps = self.times_s(episode), self.fps
+        if self.dataset.fps is None and len(times_s) > 1:
+            fps = (len(times_s) - 1) / float(times_s[-1])
+        return encoded(self.dataset.whole_frames(episode, camera), fps, take)
 
     def read(self, reading: Callable[[ShownDataset], Read]) -> Read:
         """Check the dataset, then read from it. Raises HTTPException 500 with the fault of a broken dataset."""
@@ -122,6 +133,7 @@ class ShownDataset:
             "labels": None if file is None else self._name_of(file),
             "cameras": list(self.cameras),
             "has_stored_pixels": self.has_stored_pixels,
+            "is_on_hub": self.dataset.revision is not None,
             "unused": [unused.get(camera) for camera in self.cameras],
             "left_out": dict(self.dataset.left_out),
             "corrections": [asdict(self._correction(file, camera)) for camera in self.cameras],
@@ -136,21 +148,34 @@ class ShownDataset:
                     "num_frames": episode.num_frames,
                     **rows.get(episode.index, {}),
                 }
-                for episode in self.dataset.episodes
+                for episode in self.dataset.listing
             ],
         }
 
+    def missing(self, number: int) -> dict[str, Any]:
+        """Return the size of what an episode needs from the Hub, null: all is here, and whether to ask before."""
+        size = self.dataset.missing([self._numbered(number)], self.cameras)
+        return {"size": str(size) if size else None, "asks": size is not None and size.is_large}
+
+    def download(self, number: int) -> dict[str, Any]:
+        """Download what an episode needs from the Hub, and return what is missing then."""
+        self.dataset.download([self._numbered(number)], self.cameras)
+        return self.missing(number)
+
     def faults(self) -> dict[str, str]:
-        """Return why episodes cannot be labelled now, by episode number, as ``rfm-client label`` reports it."""
+        """Return why episodes cannot be labelled now, by episode number, as ``rfm-client label`` reports it.
+
+        An episode that must be downloaded first is not checked.
+        """
         found = {}
         unused = self.dataset.unused_cameras(self.cameras)
         cameras = [camera for camera in self.cameras if camera not in unused]
-        for episode in self.dataset.episodes:
+        for number in filter(self.dataset.is_here, self.dataset.numbers):
             try:
                 for camera in cameras:
-                    self.dataset.check(episode, camera)
+                    self.dataset.check(self.dataset.episode(number), camera)
             except DatasetError as error:
-                found[str(episode.index)] = self._without_folder(str(error))
+                found[str(number)] = self._without_folder(str(error))
         return found
 
     def curves(self, number: int, labels: str | None) -> dict[str, Any]:
@@ -175,48 +200,46 @@ class ShownDataset:
         return self.mp4(self._episode(number), self.cameras[camera], take)
 
     def preview(self, number: int, labels: str | None, take: Callable[[int], object]) -> dict[str, Any]:
-        """Return an episode's progress at a few points, and its first frame as JPEG in base64; null: it cannot be read.
+        """Return an episode's progress at a few points, and its ``ends`` as JPEG in base64; none: they cannot be read.
 
         take: see ``video``
         """
-        episode, file = self._episode(number), self._labels(labels)
-        found = None if file is None else read_episode_labels(file, number)
+        file = self._labels(labels)
+        found = None if file is None else read_episode_labels(file, self._numbered(number))
         progress = None if found is None else found.fused.progress
         if progress is not None:
             places = np.linspace(0, len(progress) - 1, min(_POINTS, len(progress))).round().astype(int)
             progress = progress[places]
         unused = self.dataset.unused_cameras(self.cameras)
         camera = next((each for each in self.cameras if each not in unused), None)
-        try:
-            picture = None if camera is None else self._picture(episode, file, camera, take)
-        except DatasetError:  # the list of faults reports it
-            picture = None
-        return {"progress": [] if progress is None else progress.tolist(), "picture": picture}
+        if not self.dataset.is_here(number):
+            camera = None
+        pictures: list[str] = []
+        if camera is not None:
+            with suppress(DatasetError):  # the list of faults reports it
+                correction = self._correction(file, camera)
+                ends = self.ends(self._episode(number), camera)
+                pictures = [_jpeg(correction.applied(frame), take) for frame in ends]
+        return {"progress": [] if progress is None else progress.tolist(), "pictures": pictures}
 
-    def _picture(
-        self, episode: DatasetEpisode, file: Path | None, camera: str, take: Callable[[int], object]
-    ) -> str | None:
-        frame = next(self.dataset.stored_frames(episode, camera), None)
-        if frame is None:
-            return None
-        take(frame.nbytes)
-        image = Image.fromarray(self._correction(file, camera).applied(frame))
-        image.thumbnail(_PREVIEW_PX)
-        jpeg = io.BytesIO()
-        image.save(jpeg, "JPEG")
-        return base64.b64encode(jpeg.getvalue()).decode()
+    def ends(self, episode: DatasetEpisode, camera: str) -> list[UInt8Array]:
+        """Return the first stored frame, and the last where it is read without the others. Raises DatasetError."""
+        return list(itertools.islice(self.dataset.stored_frames(episode, camera), 1))
 
     def _without_folder(self, message: str) -> str:
         """Return a message without the folder's path, for users on other machines."""
         return message.replace(str(self.root), self.dataset.source)
 
     def _episode(self, number: int) -> DatasetEpisode:
+        return self.dataset.episode(self._numbered(number))
+
+    def _numbered(self, number: int) -> int:
         known = self.dataset.numbers
         if number not in known:
             expected = f"one from {known[0]} to {known[-1]}" if known else "none, since the dataset is empty"
             gaps = ", with gaps" if known and known[-1] - known[0] >= len(known) else ""
             raise HTTPException(404, f"episode: expected {expected}{gaps}, got {number}")
-        return self.dataset.episode(number)
+        return number
 
     def _labels(self, name: str | None) -> Path | None:
         """Return the label file with this name, by default the first; None: no labels."""
@@ -303,6 +326,16 @@ def _mux(container: Any, packets: Sequence[Any], take: Callable[[int], object]) 
     for packet in packets:
         take(packet.size)
         container.mux(packet)
+
+
+def _jpeg(frame: UInt8Array, take: Callable[[int], object]) -> str:
+    """Return a frame as a small JPEG in base64. take: see ``encoded``"""
+    take(frame.nbytes)
+    image = Image.fromarray(frame)
+    image.thumbnail(_PREVIEW_PX)
+    jpeg = io.BytesIO()
+    image.save(jpeg, "JPEG")
+    return base64.b64encode(jpeg.getvalue()).decode()
 
 
 def links_in(folder: Path) -> Iterator[Path]:

@@ -40,6 +40,7 @@ from rfm_client.cli.options import (
     WaitOptions,
 )
 from rfm_client.cli.show import scores_table, status_tables, wrapped
+from rfm_client.contract.description import TOY
 from rfm_client.contract.errors import DeadlineExceededError, RewardError
 from rfm_client.contract.results import FRAME_SCORES
 from rfm_client.plot import save
@@ -112,6 +113,8 @@ def score(
         outcomes = scoring.SourceScorer(client, video, prefix, recording).score_all(videos, tell)
     if output.prints_tables and shown:
         print("\n" + wrapped(prefix.rule, "  ", "  "))
+    if any(each.checkpoint == TOY for each in shown):
+        report(f"note: {TOY}")
     output.write_json(documents.score_document(server, video, prefix, outcomes))
     caption = output.caption
     if caption is None:

@@ -1,25 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""``rfm-client compare``: rank videos by how well they do a task.
-
-A model's preference may depend on the order of the two videos, so every pair is compared in both orders. If the orders
-disagree, the pair has no verdict.
-"""
+"""``rfm-client compare``: rank videos by how well they do a task."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from statistics import fmean
 from typing import cast
 
 from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.scoring import Source
 from rfm_client.cli.show import at_end, number, table, title_at_end
 from rfm_client.client import RewardClient
-from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError
-from rfm_client.contract.results import PreferenceResult, ProgressResult
+from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.ranking import Ranking
+from rfm_client.contract.results import PreferenceResult, ProgressResult, one_version
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Trajectory
 from rfm_client.frames.fit_to_checkpoint import fitted, with_frame_indices
 
@@ -28,50 +23,16 @@ LEGEND = (
     "A video has no rank (?) if one of its pairs has no answer."
 )
 
-Order = tuple[int, int]  # indices of the first and second video in a question
 
-
-@dataclass(frozen=True, eq=False)
-class Comparison:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Comparison(Ranking):
     """N sources, their scores, and their preferences from one model version.
 
     scores: for each source alone, as from ``score``; in a preference they depend on the other source
-    results: for both orders of every pair
     """
 
     sources: Sequence[Source]
     scores: Sequence[ProgressResult]
-    results: Mapping[Order, PreferenceResult]
-
-    def pair(self, first: int, second: int) -> PreferenceResult:
-        """Return both orders for two sources as one result."""
-        return PreferenceResult.of_both_orders(self.results[first, second], self.results[second, first])
-
-    def couples(self) -> Iterator[Order]:
-        """Yield every pair of sources once, in the given order."""
-        return itertools.combinations(self._numbers, 2)
-
-    @cached_property
-    def wins(self) -> list[float]:
-        """Each source's mean probability of winning, averaged over opponents and orders."""
-        return [
-            fmean(self.pair(index, other).preference for other in self._numbers if other != index)
-            for index in self._numbers
-        ]
-
-    @cached_property
-    def ranks(self) -> list[int | None]:
-        """Each source's rank by ``wins``, from 1; None if a pair with this source has no verdict."""
-        best_first = sorted(self._numbers, key=self.wins.__getitem__, reverse=True)
-        unranked = {index for couple in self.couples() if self.pair(*couple).verdict is None for index in couple}
-        return [None if index in unranked else best_first.index(index) + 1 for index in self._numbers]
-
-    @property
-    def ranking(self) -> list[int] | None:
-        """Source indices, best first; None if a pair has no verdict."""
-        if None in self.ranks:
-            return None
-        return sorted(self._numbers, key=lambda index: cast(int, self.ranks[index]))
 
     def tables(self) -> list[str]:
         """Return a table of sources, best first, a table of pairs, and without a ranking a legend."""
@@ -84,12 +45,8 @@ class Comparison:
         ]
 
     @property
-    def _numbers(self) -> range:
-        return range(len(self.sources))
-
-    @property
     def _shown(self) -> Sequence[int]:
-        return self.ranking or self._numbers
+        return self.ranking or self.numbers
 
     def _rank(self, index: int) -> str:
         return str(self.ranks[index] or "?")
@@ -120,10 +77,9 @@ def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> 
     scores = [
         cast(ProgressResult, with_frame_indices(each, fit.frame_indices)) for each, fit in zip(alone, fits, strict=True)
     ]
-    versions = sorted({str(result.model_version) for result in (*scores, *answers)})
-    if len(versions) > 1:
-        raise InferenceFailedError(f"model_version: expected one for all videos, got {', '.join(versions)}: ask again")
-    return Comparison(sources, scores, dict(zip(orders, cast("list[PreferenceResult]", answers), strict=True)))
+    one_version((*scores, *answers), "all videos")
+    results = dict(zip(orders, cast("list[PreferenceResult]", answers), strict=True))
+    return Comparison(sources=sources, scores=scores, results=results)
 
 
 def _of_one_task(first: Source, other: Source) -> Trajectory:

@@ -217,9 +217,9 @@ def _evaluate(
 
 
 def checkpoint_of(client: RewardClient, trajectory: Trajectory) -> str:
-    """Return where the checkpoint that scores the trajectory comes from, else the model's name."""
+    """Return what a figure says of the checkpoint that scores the trajectory: a warning, its source or its name."""
     info = client.model_info(frames=trajectory.frames is not None)
-    source = info.source or info.name
+    source = info.warning or info.source or info.name
     run = source.removesuffix("/checkpoint")  # a name, unless the folder is a version
     return source if run.isdecimal() else run
 

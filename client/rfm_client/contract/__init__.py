@@ -14,6 +14,7 @@ from rfm_client.contract.errors import (
     ServerError,
     ServerUnavailableError,
 )
+from rfm_client.contract.ranking import Ranking
 from rfm_client.contract.results import (
     FRAME_SCORES,
     FrameScores,
@@ -47,6 +48,7 @@ __all__ = [
     "ProcessEndedError",
     "ProgressResult",
     "ProgressSample",
+    "Ranking",
     "Result",
     "RewardError",
     "Sample",

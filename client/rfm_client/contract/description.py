@@ -16,6 +16,8 @@ from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, InvalidValueError
 
 DESCRIPTION_PARAMETER = "description"  # parameter in config.pbtxt
+TOY = "toy checkpoint: scores of real videos mean nothing"
+_TOYS = ("7771918ab039e37c", "b26fc8fb5d62a7a2")  # weights_digest of the toy checkpoints in this repository
 _WHERE = f"parameter {DESCRIPTION_PARAMETER}"
 
 Rule: TypeAlias = Literal["shortest", "exact"]
@@ -159,6 +161,11 @@ class Description(Origin):
     def lacks(self) -> tuple[str, ...]:
         """Scores that the checkpoint does not give, among preference, similarity and success."""
         return tuple(name for name in ("preference", "similarity", "success") if not getattr(self, f"has_{name}"))
+
+    @property
+    def warning(self) -> str | None:
+        """What everyone who sees a score must know; None: nothing."""
+        return TOY if self.weights_digest in _TOYS else None
 
     @property
     def weights(self) -> str | None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args, get_type_hints
 
@@ -258,11 +258,7 @@ class ProgressResult(FrameScores):
 
         Raises InferenceFailedError if several checkpoint versions answered.
         """
-        versions = sorted({str(part.model_version) for part in parts})
-        if len(versions) > 1:
-            got = ", ".join(versions)
-            raise InferenceFailedError(f"model_version: expected one for all frames, got {got}: ask again")
-        return cls(**vars(cls.joined(parts)), model_version=parts[-1].model_version)
+        return cls(**vars(cls.joined(parts)), model_version=one_version(parts, "all frames"))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -288,9 +284,7 @@ class PreferenceResult:
 
         Raises InferenceFailedError if two checkpoint versions answered.
         """
-        if asked.model_version != swapped.model_version:
-            got = f"{asked.model_version}, {swapped.model_version}"
-            raise InferenceFailedError(f"model_version: expected one for both orders, got {got}: ask again")
+        one_version((asked, swapped), "both orders")
         both = (asked.preference, 1 - swapped.preference)
         return replace(asked, preference=sum(both) / len(both), both_orders=both)
 
@@ -317,6 +311,18 @@ class SimilarityResult:
 
 
 Result: TypeAlias = ProgressResult | PreferenceResult | SimilarityResult
+
+
+def one_version(results: Iterable[Result], what: str) -> str | None:
+    """Return the checkpoint version that answered. Raises InferenceFailedError for several.
+
+    what: what it answered, for the message
+    """
+    versions = {result.model_version for result in results}
+    if len(versions) > 1:
+        got = ", ".join(sorted(map(str, versions)))
+        raise InferenceFailedError(f"model_version: expected one for {what}, got {got}: ask again")
+    return next(iter(versions), None)
 
 
 def trajectory_scores(result: Result) -> dict[str, FrameScores]:

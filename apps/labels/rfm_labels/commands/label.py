@@ -20,6 +20,7 @@ from rfm_labels.audit import audit
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, SeveralTasks, parsed_by_camera
 from rfm_labels.datasets.faults import FaultsError, UnusedTaskError, listed, require
 from rfm_labels.datasets.hdf5 import label_prefix
+from rfm_labels.datasets.hub import ASK_BYTES, DownloadSize
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
 from rfm_labels.datasets.opening import hdf5_files, open_dataset
 from rfm_labels.label_files import LabelFile, find_label_files, read_blank, reward_name
@@ -33,7 +34,6 @@ from rfm_labels.scorer import ClientScorer, Scorer
 from rfm_labels.summary import summarise
 from rfm_labels.writing import remove_files
 
-ASK_BYTES = 10e9  # downloads above this need a confirmation
 SPEED_OVER_S = 600.0  # an episode may take minutes
 Printer: TypeAlias = Callable[[str], None]
 _CAMERA_OPTIONS = ("orient", "channels")  # options with a value per camera
@@ -89,9 +89,9 @@ class ProgressBar(Watch):
 
     def downloading(self, num_files: int, num_bytes: int) -> None:
         """Write how much is downloaded. Raises ConfigError, or typer.Abort after a "no", for a large download."""
-        size = f"{num_bytes / 1e9:.2f} GB in {counted(num_files, 'file')}"
+        size = DownloadSize(num_files, num_bytes)
         self.note(f"downloading {size}, all that the chosen episodes and cameras need")
-        if num_bytes <= ASK_BYTES or self._accepts:
+        if not size.is_large or self._accepts:
             return
         self._bar.stop()
         remedy = "choose fewer episodes (--episodes, --limit) or cameras (--cameras)"

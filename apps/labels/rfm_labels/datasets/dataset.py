@@ -20,6 +20,8 @@ from rfm_client import RewardError, Trajectory, UInt8Array
 from rfm_client.frames import ChannelOrder, Correction, Orientation
 from rfm_client.options import ConfigError, is_blank
 from rfm_labels.datasets.faults import DatasetError, FaultsError, MissingTaskError, UnusedTaskError, require
+from rfm_labels.datasets.hub import DownloadSize
+from rfm_labels.datasets.stored_files import Times
 
 LEAST_SIZE_PX = 8  # per side; a smaller numeric array is no picture
 _WORDS = frozenset(
@@ -293,6 +295,23 @@ class Dataset(ABC):
 
         accept: called before a download with its files and bytes; may raise an error
         """
+
+    def missing(self, numbers: Sequence[int], cameras: Sequence[str]) -> DownloadSize | None:
+        """Return what these episodes and cameras need from the Hub; None: all is here. Raises DatasetError."""
+        return None
+
+    def is_here(self, number: int) -> bool:
+        """True if nothing of an episode must be downloaded first."""
+        return True
+
+    @property
+    def listing(self) -> Sequence[DatasetEpisode]:
+        """``episodes``; of a dataset on the Hub as its metadata list them, so that no row table is downloaded."""
+        return self.episodes
+
+    def times_s(self, episode: DatasetEpisode) -> Times | None:
+        """Return frame times from the episode's start, float64 [T]; None: unknown. Raises DatasetError."""
+        return None
 
     def unused_files(self) -> Sequence[Path]:
         """Return files with rows or frames that no episode uses, relative to ``root``; empty for most layouts."""

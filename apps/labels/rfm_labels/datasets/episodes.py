@@ -25,6 +25,7 @@ from rfm_labels.datasets.pictures_in_order import missing_numbers, pictures_in
 from rfm_labels.datasets.recorded import Recorded, RecordedDataset, Stored
 from rfm_labels.datasets.stored_files import (
     Span,
+    Times,
     check_pictures,
     colours_fault,
     digest_of,
@@ -109,6 +110,12 @@ class _VideoFile(Stored):
         num_timed, expected = len(packets.times_s), f"{packets.count or 'some'} frames with time stamps"
         require(self._file, num_timed == packets.count > 0, expected, num_timed)
         return packets.count
+
+    @property
+    def times_s(self) -> Times:
+        with faults_at(self._file):
+            times_s: Times = self._opened(self._file).packets.times_s
+        return times_s - float(times_s[0])
 
     def identity(self) -> str:
         return file_identity(self._file)

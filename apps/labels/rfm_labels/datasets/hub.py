@@ -6,14 +6,34 @@ from __future__ import annotations
 import glob
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
 from rfm_client.frames import cached_snapshot, hub_errors
+from rfm_client.options import counted
 from rfm_labels.datasets.faults import DatasetError
 
+ASK_BYTES = 10e9  # downloads above this need a confirmation
 _METADATA = ["meta/*", "meta_data/*"]  # the second: LeRobot v1, which a message names
 _NAMES_AT_A_TIME = 500  # per request for sizes
+
+
+@dataclass(frozen=True)
+class DownloadSize:
+    """The size of a download. ``str`` tells users."""
+
+    num_files: int
+    num_bytes: int
+
+    @property
+    def is_large(self) -> bool:
+        """True if users are asked first."""
+        return self.num_bytes > ASK_BYTES
+
+    def __str__(self) -> str:
+        size = f"{self.num_bytes / 1e9:.2f} GB" if self.num_bytes >= 1e9 else f"{self.num_bytes / 1e6:.1f} MB"
+        return f"{size} in {counted(self.num_files, 'file')}"
 
 
 class HubFiles:

@@ -18,7 +18,7 @@ from rfm_client.frames import Picture, Video
 from rfm_client.options import InvalidValueError, checked_finite
 from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, listed, require
-from rfm_labels.datasets.hub import HubFiles
+from rfm_labels.datasets.hub import DownloadSize, HubFiles
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S, Frames, Part, VideoRows
 from rfm_labels.datasets.lerobot_meta import (
     EPISODES_FILE,
@@ -73,6 +73,7 @@ class LeRobotDataset(Dataset):
         self.source = root.resolve().name if hub is None else hub.name
         self.revision = None if hub is None else hub.commit
         self.info = info = Info.read(root)
+        self.fps = info.fps
         self.kind = f"LeRobot {info.version}"
         self.cameras = (*info.videos, *info.images)
         self.depth_cameras, self.left_out, self.notes = info.depth, info.left_out, info.notes
@@ -124,17 +125,37 @@ class LeRobotDataset(Dataset):
     def download(
         self, numbers: Sequence[int], cameras: Sequence[str], accept: Callable[[int, int], None] | None = None
     ) -> None:
+        sizes = self._sizes(numbers, cameras)
+        if sizes and accept is not None:
+            accept(len(sizes), sum(sizes.values()))
+        if self._hub is not None:
+            self._hub.download(self.root / name for name in sizes)
+
+    def missing(self, numbers: Sequence[int], cameras: Sequence[str]) -> DownloadSize | None:
+        sizes = self._sizes(numbers, cameras)
+        return DownloadSize(len(sizes), sum(sizes.values())) if sizes else None
+
+    def _sizes(self, numbers: Sequence[int], cameras: Sequence[str]) -> Mapping[str, int]:
+        """The sizes in bytes of the files that are only on the Hub, by name."""
+        return {} if self._hub is None else self._hub.sizes(self._files_of(numbers, cameras))
+
+    def is_here(self, number: int) -> bool:
+        return self._hub is None or all(file.exists() for file in self._files_of([number], self.cameras))
+
+    @property
+    def listing(self) -> Sequence[DatasetEpisode]:
         if self._hub is None:
-            return
+            return self.episodes
+        entries = map(self._entry, self.numbers)
+        return [DatasetEpisode(each.index, each.where, " ".join(each.tasks[:1]), each.length, 0) for each in entries]
+
+    def _files_of(self, numbers: Sequence[int], cameras: Sequence[str]) -> list[Path]:
+        """The files that these episodes and cameras need, by the metadata."""
         entries = [each for number in numbers if isinstance(each := self._entries[number], Entry)]
         places = [entry.videos.get(camera) for entry in entries for camera in cameras]
         videos = {place[0] for place in places if isinstance(place, tuple)}
         shared = [each for (_, video), sharing in self._in_video.items() if video in videos for each in sharing]
-        files = [*videos, *(entry.data_file for entry in (*entries, *shared))]
-        sizes = self._hub.sizes(files)
-        if sizes and accept is not None:
-            accept(len(sizes), sum(sizes.values()))
-        self._hub.download(self.root / name for name in sizes)
+        return [*videos, *(entry.data_file for entry in (*entries, *shared))]
 
     def unused_files(self) -> Sequence[Path]:
         entries = [each for each in self._entries.values() if isinstance(each, Entry)]
@@ -178,7 +199,6 @@ class LeRobotDataset(Dataset):
         return picture_frames(self._images(episode, camera), self.place(episode, camera))
 
     def times_s(self, episode: DatasetEpisode) -> Times:
-        """Return frame times from the episode's start, float64 [T]. Raises DatasetError."""
         return self._rows.read(self._entry(episode.index)).times_s
 
     def span(self, episode: DatasetEpisode, camera: str) -> Span:

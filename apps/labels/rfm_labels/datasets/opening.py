@@ -13,7 +13,6 @@ import os
 import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path, PurePath
-from typing import Any
 
 from rfm_client.frames import ChannelOrder, Orientation
 from rfm_client.options import first_names
@@ -156,10 +155,8 @@ def open_dataset(
         return LeRobotDataset(path, task=given, corrections=asked, tolerance_s=tolerance_s)
     if path.exists():
         return _open_path(path, given, asked)
-    match = _HUB_ID.fullmatch(str(source))
-    if match is None:
-        raise DatasetError.at(source, _LAYOUTS, "none")
-    return _from_hub(match[1], match[2] or match[3], task=given, corrections=asked, tolerance_s=tolerance_s)
+    hub = _on_hub(source)
+    return LeRobotDataset(hub.folder, hub=hub, task=given, corrections=asked, tolerance_s=tolerance_s)
 
 
 def _open_path(path: Path, task: TaskOverride, corrections: AskedCorrections) -> Dataset:
@@ -170,16 +167,22 @@ def _open_path(path: Path, task: TaskOverride, corrections: AskedCorrections) ->
     return (Hdf5Dataset if is_hdf5(path) else _open_files)(path, task=task, corrections=corrections)
 
 
-def _from_hub(name: str, revision: str | None, **opening: Any) -> LeRobotDataset:
-    hub = HubFiles(name, revision)
+def _on_hub(source: str | Path) -> HubFiles:
+    """Return the files of a LeRobot dataset on the Hub. Raises DatasetError."""
+    match = _HUB_ID.fullmatch(str(source))
+    if match is None:
+        raise DatasetError.at(source, _LAYOUTS, "none")
+    hub = HubFiles(match[1], match[2] or match[3])
     if not (hub.folder / INFO_FILE).is_file():
         got = (hub.folder.is_dir() and _unread(hub.folder)) or "none: hf download it, and name its folder"
-        raise DatasetError.at(name, f"a LeRobot dataset's {INFO_FILE}", got)
-    return LeRobotDataset(hub.folder, hub=hub, **opening)
+        raise DatasetError.at(match[1], f"a LeRobot dataset's {INFO_FILE}", got)
+    return hub
 
 
-def open_to_show(source: str) -> Dataset:
-    """Open a dataset for a viewer: a path, or ``READER=FOLDER`` or ``PATTERN=FOLDER``. Raises DatasetError.
+def open_to_show(source: str) -> list[Dataset]:
+    """Open what a viewer shows: a dataset, for a folder of HDF5 files one for each. Raises DatasetError.
+
+    source: path, Hub id or address, ``READER=FOLDER`` or ``PATTERN=FOLDER``
 
     Accepts blank and outdated tasks. In a LeRobot dataset, a row shows the nearest frame, as a player does.
     """
@@ -187,15 +190,16 @@ def open_to_show(source: str) -> Dataset:
     no_tasks, as_stored = TaskOverride(is_needed=False), AskedCorrections()
     require("", bool(folder) or not (is_reader(how) or "{episode}" in how), f"{how}=FOLDER", source)
     if is_reader(how):
-        return open_read(how, Path(folder).resolve(), no_tasks, as_stored)
+        return [open_read(how, Path(folder).resolve(), no_tasks, as_stored)]
     if "{episode}" in how:
-        return _by_pattern(Path(folder).resolve(), how, no_tasks, as_stored)
+        return [_by_pattern(Path(folder).resolve(), how, no_tasks, as_stored)]
     path = Path(source).resolve()
-    if (path / INFO_FILE).is_file():
+    hub = None if path.exists() else _on_hub(source)
+    root = path if hub is None else hub.folder
+    if (root / INFO_FILE).is_file():
         task = TaskOverride(column=TASK_COLUMN, is_needed=False)
-        return LeRobotDataset(path, task=task, tolerance_s=0.5 / Info.read(path).fps)
-    require("", path.exists(), _LAYOUTS, source)
-    return _open_path(path, no_tasks, as_stored)
+        return [LeRobotDataset(root, hub=hub, task=task, tolerance_s=0.5 / Info.read(root).fps)]
+    return [_open_path(each, no_tasks, as_stored) for each in hdf5_files(path) or [path]]
 
 
 def hdf5_files(folder: str | Path) -> list[Path]:

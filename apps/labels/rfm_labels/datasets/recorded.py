@@ -11,6 +11,7 @@ from typing import Any
 from rfm_client import RewardError, UInt8Array
 from rfm_labels.datasets.dataset import CountedDataset, DatasetEpisode
 from rfm_labels.datasets.faults import DatasetError, FaultsError, require
+from rfm_labels.datasets.stored_files import Times
 
 
 class Stored(ABC):
@@ -28,6 +29,11 @@ class Stored(ABC):
     @abstractmethod
     def frames(self) -> Iterator[UInt8Array]:
         """Yield the frames, as ``Dataset.stored_frames``."""
+
+    @property
+    def times_s(self) -> Times | None:
+        """Times of the frames from the first, float64 [T]; None: unknown. Raises DatasetError."""
+        return None
 
     @staticmethod
     def decoder() -> str | None:
@@ -121,6 +127,10 @@ class RecordedDataset(CountedDataset):
         one, length = self.recorded[number], self.length(number)
         task = self.given_task.of(one.task_place, one.task)
         return DatasetEpisode(number, one.name, task, length, self.frames_before(number))
+
+    def times_s(self, episode: DatasetEpisode) -> Times | None:
+        first = next(iter(self.recorded[episode.index].cameras.values()))
+        return first.times_s if self.fps is None else None
 
     def decoder(self, camera: str) -> str | None:
         kinds = {type(one.cameras[camera]) for one in self.recorded.values() if camera in one.cameras}

@@ -36,7 +36,7 @@ export async function served() {
   return (await answer("viewer/served")).json();
 }
 
-/** What the model prefers of two videos, asked in both orders. */
+/** How the model ranks videos, each pair asked in both orders. */
 export async function compare(form, signal) {
   return (await answer("viewer/compare", { method: "POST", body: form, signal })).json();
 }
@@ -71,6 +71,11 @@ export async function faultsOf(number, signal) {
 /** The labelled curves of an episode. */
 export async function curvesOf(number, episode, labels, signal) {
   return (await answer(`viewer/datasets/${number}/episodes/${episode}${chosen(labels)}`, { signal })).json();
+}
+
+/** What an episode needs from the Hub: its `size`, null if all is here, and whether it `asks` before; begins: downloads it first */
+export async function missingOf(number, episode, signal, begins = false) {
+  return (await answer(`viewer/datasets/${number}/episodes/${episode}/missing`, { signal, ...(begins && { method: "POST" }) })).json();
 }
 
 /** A few points of an episode's curve, and a small picture. */

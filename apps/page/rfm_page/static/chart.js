@@ -21,6 +21,8 @@ const LOW_PX = 240; // a chart so low has fewer marks
 const WITH_SUCCESS = { leading: [0.37, 0.98], success: [0.03, 0.27] }; // shares of the height
 const LOW_WITH_SUCCESS = { leading: [0.46, 0.98], success: [0.03, 0.36] };
 const WITHOUT_SUCCESS = { leading: [0.03, 0.98] };
+const HALVING_PX = 200; // turns of the wheel that halve the time that is shown
+const MOST_ZOOM = 500;
 const GAP = 0.06; // of the height, between progress and what other models predict in place of it
 
 /** The name of the colour of curve number `index`, which the style sheet has for each theme. */
@@ -73,6 +75,7 @@ export class Chart {
   #panes = panesOf([]);
   #shape = "";
   #end = 1;
+  #view = null; // from and to, seconds; null: all
   #threshold = 0.5;
   #time = 0;
   #pointedTop = 0; // height of the pointer
@@ -100,8 +103,10 @@ export class Chart {
   show(curves) {
     this.#curves = curves.filter(({ times }) => times.length);
     this.#panes = panesOf(this.#curves, this.#isLow);
+    const before = this.#end;
     this.#end = Math.max(0, ...this.#curves.map(({ allTimes }) => allTimes.at(-1))); // so that the axis does not grow
     if (this.#end <= 0) this.#end = 1; // uPlot divides an axis of no length for ever
+    if (this.#end !== before) this.#view = null;
     const signals = Object.keys(this.#panes);
     const tables = this.#drawn.map((curve) => [
       curve.times, ...signals.map((signal) => curve.times.map((_, index) => heightOf(this.#panes, signal, curve[signal]?.[index]))),
@@ -242,7 +247,7 @@ export class Chart {
       padding: [4, this.#rightPx, 4, 0],
       legend: { show: false },
       cursor: { x: false, y: false, points: { show: false }, drag: { x: false, y: false } },
-      scales: { x: { time: false, range: () => [0, this.#end] }, y: { range: [0, 1] } },
+      scales: { x: { time: false, range: () => this.#view ?? [0, this.#end] }, y: { range: [0, 1] } },
       axes: [{ ...axis, size: 24, space: MARK_PX, label: "time (s)" }, left],
       series: [{}, ...series],
       hooks: { drawAxes: [(plot) => clearBetween(plot, panes)], draw: [(plot) => drawNames(plot, panes, letterPx)], setSize: [() => this.#placeAgain()] },
@@ -259,6 +264,27 @@ export class Chart {
     this.moveTo(this.#time);
   }
 
+  /** Zooms around the pointer with Ctrl, or two fingers; moves what is shown sideways. */
+  #turned(event, plot) {
+    const isSideways = event.shiftKey || Math.abs(event.deltaX) > Math.abs(event.deltaY);
+    if (!event.ctrlKey && !(this.#view && isSideways)) return; // the page scrolls
+    event.preventDefault();
+    const { left, width } = plot.over.getBoundingClientRect();
+    const [from, to] = this.#view ?? [0, this.#end];
+    const share = (event.clientX - left) / width;
+    const zoom = event.ctrlKey ? 2 ** (event.deltaY / HALVING_PX) : 1;
+    const length = Math.min(Math.max((to - from) * zoom, this.#end / MOST_ZOOM), this.#end);
+    const moved = event.ctrlKey ? share * (to - from - length) : ((event.deltaX || event.deltaY) / width) * length;
+    const begin = Math.min(Math.max(from + moved, 0), this.#end - length);
+    this.#look(length < this.#end ? [begin, begin + length] : null);
+  }
+
+  #look(view) {
+    this.#view = view;
+    this.#plot.setData(this.#plot.data);
+    this.moveTo(this.#time);
+  }
+
   #listen(plot) {
     const tell = (event) => {
       const bounds = plot.over.getBoundingClientRect();
@@ -271,6 +297,8 @@ export class Chart {
       tell(event);
     });
     plot.over.addEventListener("pointermove", tell);
+    plot.over.addEventListener("wheel", (event) => this.#turned(event, plot), { passive: false });
+    plot.over.addEventListener("dblclick", () => this.#look(null));
     this.#line.onpointerdown = (event) => {
       if (!this.#onThreshold) return;
       event.stopPropagation();

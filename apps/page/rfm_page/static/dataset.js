@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: MIT
 // The tab of datasets: how their episodes end, which one wants to see first, one that is watched, some that are taken along.
 
-import { curvesOf, datasets, episodesOf, faultsOf, previewOf, videoOf } from "./api.js";
+import { curvesOf, datasets, episodesOf, faultsOf, missingOf, previewOf, videoOf } from "./api.js";
 import { Asking } from "./asking.js";
 import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, UNDONE, WORST_FIRST } from "./episodes.js";
-import { deadLink, failure, noDataset, noEpisode, noHit, noVideo } from "./faults.js";
+import { deadLink, downloading, failure, noDataset, noEpisode, noHit, noVideo } from "./faults.js";
 import { episodesJson, episodesText, lerobotWords } from "./exports.js";
 import { Histogram } from "./histogram.js";
 import { onKeys } from "./keys.js";
@@ -337,6 +337,7 @@ export class DatasetTab {
     this.#shown = sorted(kept(this.#episodes, filters, page["task-part"].value), page.order.value, this.#isTurned);
     this.#showNoHits();
     this.#table.show(this.#shown, this.#threshold);
+    page["order-told"].textContent = this.#isTurned ? "" : page.order.selectedOptions[0]?.title ?? "";
     page["shown-told"].textContent = `${this.#shown.length} of ${this.#episodes.length}`;
     for (const head of page["episode-list"].querySelectorAll("th[data-order]")) {
       const isFalling = ["backwards", "disagreement", "difference"].includes(head.dataset.order) !== this.#isTurned;
@@ -478,10 +479,25 @@ export class DatasetTab {
     }
   }
 
+  /** Lets the server download what it lacks of an episode on the Hub, and says how much; asks before a large download. */
+  async #download(episode, signal) {
+    if (!this.#told.is_on_hub) return;
+    const place = this.#places.episode;
+    const { size, asks } = await missingOf(this.#number, episode, signal);
+    if (size === null || signal.aborted) return;
+    this.#timeline.show([]);
+    if (asks) await new Promise((accept) => place.show(downloading(episode, size, accept)));
+    if (signal.aborted) return;
+    place.show(downloading(episode, size));
+    await missingOf(this.#number, episode, signal, true);
+    if (!signal.aborted) place.clear();
+  }
+
   async #fetch({ episode }, signal) {
     const { cameras, unused, corrections } = this.#told;
     const other = this.#page.others.value;
     const names = [this.#labels, ...(other ? [other] : [])];
+    await this.#download(episode, signal);
     const told = await Promise.all(names.map((name) => curvesOf(this.#number, episode, name, signal)));
     const curves = [...curvesIn(told[0], null), ...told.slice(1).flatMap((each) => curvesIn(each, other).slice(0, 1))];
     this.#timeline.time = 0;
@@ -491,7 +507,7 @@ export class DatasetTab {
     const blobs = await Promise.all(cameras.map((_, camera) => videoOf(this.#number, episode, camera, signal)));
     if (signal.aborted) return;
     if (!cameras.length) this.#places.episode.show(noVideo(() => this.#watch(this.#watched)));
-    const { name } = this.#datasets[this.#number];
+    const name = this.#datasets[this.#number].name.replace("/", "_"); // of the Hub
     cameras.forEach((camera, index) => {
       const file = `${name}_episode_${`${episode}`.padStart(6, "0")}.${short(camera)}.mp4`;
       this.#watched.files.push(new File([blobs[index]], file, { type: blobs[index].type }));

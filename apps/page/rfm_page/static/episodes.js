@@ -154,10 +154,10 @@ export class EpisodeTable {
       const isBelow = place > 0 && value !== undefined && value !== null && value < this.#threshold;
       row.append(isBelow ? cell(shownBelow(value, this.#threshold), "number below") : cell(shown(value), "number"));
     });
-    const { picture, curve } = blank();
-    header.prepend(picture);
+    const { pictures, curve } = blank();
+    header.prepend(...pictures);
     row.cells[PROGRESS].prepend(curve);
-    this.#previews.fill(episode, row, picture, curve);
+    this.#previews.fill(episode, row, pictures, curve);
     row.append(cell(percent(episode.backwards), "number"), cell(shown(episode.disagreement), "number"));
     row.append(cell(`${shown(episode.difference)}${episode.verdict_differs ? " ≠" : ""}`, "number difference"));
     row.addEventListener("click", () => this.#onWatch(episode));

@@ -36,13 +36,17 @@ function edited({ name, kind }, away, all, ending) {
   const early = kind.includes("v3") ? [] : [`# lerobot-edit-dataset reads v3.0, and this is ${kind}: convert it before`];
   const [source, target] = [quoted(name), quoted(`${name}_${ending}`)];
   const operation = `--operation.type delete_episodes --operation.episode_indices "${list(away)}"`;
+  const renumbered = commented(`LeRobot renumbers the episodes and leaves the labels behind: label ${target} again`);
+  if (name.includes("/")) { // on the Hub
+    return [...early, `lerobot-edit-dataset --repo_id ${source} --new_repo_id ${target} ${operation}`, renumbered].join("\n");
+  }
   return [
     ...early,
     "# LeRobot 0.5 or newer, in the folder that holds the dataset:",
     `lerobot-edit-dataset --repo_id ${source} --root ${source} --new_repo_id ${target} --new_root ${target} ${operation}`,
     "# LeRobot 0.4, which has no --new_root:",
     commented(`HF_LEROBOT_HOME=. lerobot-edit-dataset --repo_id ${source} --new_repo_id ${target} ${operation}`),
-    commented(`LeRobot renumbers the episodes and leaves the labels behind: label ${target} again`),
+    renumbered,
   ].join("\n");
 }
 

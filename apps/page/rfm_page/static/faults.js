@@ -85,6 +85,13 @@ export function noVideo(retry) {
   };
 }
 
+/** An episode whose files are on the Hub. accept: begins the download, which is large; null: it has begun */
+export function downloading(episode, size, accept = null) {
+  const text = `Episode ${episode} needs ${size} from the Hub.`;
+  if (accept) return { kind: "empty", title: "A large download", text, buttons: [["Download", accept]] };
+  return { kind: "empty", title: "Downloading", text, note: "The episode opens when its files are here." };
+}
+
 /** A link names a model that is not served. */
 export function otherModel(wanted, chosen) {
   return { title: `The model ${wanted} is not served here`, text: `The link names it. The model ${chosen} is chosen instead.` };

@@ -11,6 +11,7 @@ const [LEFT, RIGHT, TOP] = [34, 10, 6];
 const LINE = 10; // points
 const FONT = "Helvetica, Arial, sans-serif";
 const LETTERS = 42; // that fit into the width
+const SMALL_LETTERS = 54; // of the titles below the first
 const NUM_TIMES = 6;
 const PNG_WIDTH_PX = 2100; // 600 dots an inch: twice what papers ask of pictures
 
@@ -39,7 +40,7 @@ export function svgFigure(template, curves, { titles, threshold, label = "time (
   const add = (...rest) => svg.append(made(...rest));
   add("rect", { width: WIDTH, height, fill: themed("--page", template) });
   titles.forEach((text, place) => {
-    add("text", { x: LEFT, y: TOP + 8 + place * LINE, "font-size": place ? 7 : 8, fill: place ? faint : ink }, cut(text, LETTERS));
+    add("text", { x: LEFT, y: TOP + 8 + place * LINE, "font-size": place ? 7 : 8, fill: place ? faint : ink }, cut(text, place ? SMALL_LETTERS : LETTERS));
   });
   for (const signal of Object.keys(panes)) {
     const { scale } = panes[signal];

@@ -21,7 +21,7 @@ import { Tabs } from "./tabs.js";
 import { Timeline } from "./timeline.js";
 import { commands, csv, json, save } from "./takeaway.js";
 import { learn, toldAt } from "./signals.js";
-import { addVerdict, areOneFile, sentenceOf } from "./verdicts.js";
+import { addVerdict, ofOneFile, sentenceOf } from "./verdicts.js";
 
 const CURVES_AT_A_TIME = 3;
 
@@ -142,6 +142,8 @@ function chooseRule() {
   const model = gateway.models.find(({ name }) => name === page.model.value);
   if (model) page.rule.value = model.rule;
   page["one-view"].hidden = !model?.reads_views;
+  page.warning.textContent = model?.warning ?? "";
+  page.warning.hidden = !model?.warning;
   page.threshold.parentElement.hidden = model?.has_success === false;
   showLimits();
 }
@@ -258,6 +260,7 @@ function scoreAll() {
   places.errors.clear();
   page.status.textContent = "";
   if (page.score.disabled) return;
+  sidebar.giveWay();
   const known = new Set(curves.filter(({ error }) => !error).map(({ identity }) => identity));
   for (const video of videos.all) {
     for (const task of tasks()) {
@@ -296,27 +299,28 @@ function showEnds() {
   if (isOver && !videos.isPlaying) timeline.moveTo(Infinity);
 }
 
-async function comparePair() {
-  const [first, second] = videos.all;
+async function compareAll() {
+  const all = videos.all;
   const { model, fps, resize } = settings();
-  const { orient, channels } = first;
+  const { orient, channels } = all[0];
   const before = verdicts.length;
   places.errors.clear();
   page.compare.disabled = true;
   try {
     if (!tasks().length) throw new Error("task: expected a sentence, got none");
     for (const name of ["orient", "channels"]) {
-      if (second[name] !== first[name]) throw new Error(`${name}: expected the same of both videos, got ${first[name]} and ${second[name]}`);
+      const other = all.find((video) => video[name] !== all[0][name]);
+      if (other) throw new Error(`${name}: expected the same of all videos, got ${all[0][name]} and ${other[name]}`);
     }
-    const isOneFile = await areOneFile(first.file, second.file);
-    if (isOneFile) tell({ videos: [first, second], answer: null });
-    for (const task of isOneFile ? [] : tasks()) {
-      const data = form({ task, model, fps, orient, channels, resize }, { first: first.file, second: second.file });
-      const answer = await compare(data, stopping.signal);
-      tell({ videos: [first, second], task, model, fps, orient, channels, resize, answer });
+    const twice = await ofOneFile(all);
+    if (twice) tell({ videos: twice, answer: null });
+    for (const task of twice ? [] : tasks()) {
+      const files = Object.fromEntries(all.map(({ file }, index) => [`video_${index}`, file]));
+      const answer = await compare(form({ task, model, fps, orient, channels, resize }, files), stopping.signal);
+      tell({ videos: all, task, model, fps, orient, channels, resize, answer });
     }
   } catch (error) {
-    if (!stopping.signal.aborted) failed(error, "The videos could not be compared", comparePair);
+    if (!stopping.signal.aborted) failed(error, "The videos could not be compared", compareAll);
   }
   update();
   if (verdicts.length > before) page.status.textContent = verdicts.slice(before).map(sentenceOf).join(" ");
@@ -441,7 +445,7 @@ function figure() {
     return names.size === 1 ? told(scored[0]) : `${names.size} ${kind}`;
   };
   const episodeOf = ({ name, video: { origin } }) => (origin?.dataset ? `${origin.dataset}, episode ${origin.episode}` : name);
-  const titles = [named(({ task }) => task, "tasks"), named(episodeOf, "videos"), named(checkpointOf, "checkpoints")];
+  const titles = [named(({ task }) => task, "tasks"), named(episodeOf, "videos"), named((curve) => modelOf(curve)?.warning ?? checkpointOf(curve), "checkpoints")];
   return svgFigure(page.figure, scored, { titles, threshold: Number(page.threshold.value) });
 }
 
@@ -465,7 +469,7 @@ function update() {
   }
   showTable(page.curves, curves, Number(page.threshold.value));
   page.stop.disabled = queue.isIdle;
-  page.compare.disabled = videos.all.length !== 2 || !page.model.value;
+  page.compare.disabled = videos.all.length < 2 || !page.model.value;
   page.take.hidden = !scored.length && !answered().length;
   page.verdicts.hidden = !verdicts.length;
   page.png.disabled = page.svg.disabled = page.csv.disabled = !scored.length;
@@ -490,8 +494,12 @@ function howMany() {
 }
 
 /** The checkpoint that answers a question. */
-function checkpointOf({ model }) {
-  return gateway.models.find(({ name }) => name === model)?.source ?? model;
+function checkpointOf(curve) {
+  return modelOf(curve)?.source ?? curve.model;
+}
+
+function modelOf({ model }) {
+  return gateway.models.find(({ name }) => name === model);
 }
 
 /** The settings belong to the tabs that have some, and what is said of curves to the first. */
@@ -526,7 +534,7 @@ listen(page.rule, { change: showLimits });
 for (const select of [page.orient, page.channels]) listen(select, { change: () => videos.correct(correction()) });
 listen(page.stop, { click: stop });
 listen(page.clear, { click: clearForNow });
-listen(page.compare, { click: comparePair });
+listen(page.compare, { click: compareAll });
 listen(page.threshold, { input: showThreshold });
 listen(page.tasks, { keydown: (event) => { if (event.key === "Enter" && (event.ctrlKey || event.metaKey)) scoreAll(); } });
 listen(page.examples, { click: ({ target }) => {

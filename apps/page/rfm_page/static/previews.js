@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// What each row of a table shows of its episode: the first frame, and the curve of progress.
+// What each row of a table shows of its episode: the first and the last frame, and the curve of progress.
 
 import { svgElement } from "./svg.js";
 
@@ -15,7 +15,7 @@ export class Previews {
   #numAsked = 0;
   #timer = null;
 
-  /** ask(episode): a promise of `progress` and `picture` in base64, which fails if the table is another meanwhile */
+  /** ask(episode): a promise of `progress` and `pictures` in base64, which fails if the table is another meanwhile */
   constructor(ask) {
     this.#ask = ask;
   }
@@ -31,15 +31,15 @@ export class Previews {
     this.#known = new Map();
   }
 
-  /** Fills a picture and a curve as soon as somebody can see their row. */
-  fill(episode, row, picture, curve) {
+  /** Fills pictures and a curve as soon as somebody can see their row. */
+  fill(episode, row, pictures, curve) {
     if (!this.#known) return;
     const preview = this.#known.get(episode.episode);
     if (preview) {
-      draw(preview, picture, curve);
+      draw(preview, pictures, curve);
       return;
     }
-    this.#waiting.push({ episode, row, picture, curve });
+    this.#waiting.push({ episode, row, pictures, curve });
     clearTimeout(this.#timer);
     this.#timer = setTimeout(() => this.#next(), REST_MS);
   }
@@ -49,14 +49,14 @@ export class Previews {
     while (this.#numAsked < AT_A_TIME && this.#waiting.length) this.#fetch(this.#waiting.shift());
   }
 
-  async #fetch({ episode, picture, curve }) {
+  async #fetch({ episode, pictures, curve }) {
     this.#numAsked += 1;
     const known = this.#known;
     try {
       const preview = await this.#ask(episode);
       known.set(episode.episode, preview);
       if (known.size > MOST_KNOWN) known.delete(known.keys().next().value);
-      draw(preview, picture, curve);
+      draw(preview, pictures, curve);
     } catch { // the row stays without; whatever is wrong is told where somebody asks for more
     } finally {
       this.#numAsked -= 1;
@@ -65,19 +65,20 @@ export class Previews {
   }
 }
 
-function draw({ picture: jpeg, progress }, picture, curve) {
-  if (jpeg) picture.src = `data:image/jpeg;base64,${jpeg}`;
+function draw({ pictures: jpegs, progress }, pictures, curve) {
+  jpegs.forEach((jpeg, place) => { pictures[place].src = `data:image/jpeg;base64,${jpeg}`; });
   const there = progress.map((value, index) => [index, value]).filter(([, value]) => value !== null);
   const x = (index) => 1 + (index / Math.max(progress.length - 1, 1)) * (WIDTH - 2);
   const y = (value) => 1 + (1 - Math.min(Math.max(value, 0), 1)) * (HEIGHT - 2);
   curve.firstChild.setAttribute("points", there.map(([index, value]) => `${x(index).toFixed(1)},${y(value).toFixed(1)}`).join(" "));
 }
 
-/** An empty picture and an empty curve. */
+/** Two empty pictures and an empty curve. */
 export function blank() {
-  const picture = document.createElement("img");
-  Object.assign(picture, { alt: "", className: "thumb" });
+  const pictures = ["First frame", "Last frame"].map((title) => {
+    return Object.assign(document.createElement("img"), { alt: "", title, className: "thumb" });
+  });
   const curve = svgElement("svg", { class: "spark", width: WIDTH, height: HEIGHT, "aria-hidden": "true" });
   curve.append(svgElement("polyline", {}));
-  return { picture, curve };
+  return { pictures, curve };
 }

@@ -12,8 +12,7 @@ export class Sidebar {
 
   constructor(button) {
     this.#button = button;
-    const told = remembered(KEY);
-    this.#show(told === null ? matchMedia(WIDE).matches : told !== CLOSED);
+    this.#show(this.#isWide && remembered(KEY) !== CLOSED);
     button.addEventListener("click", () => this.#set(!this.#isOpen));
   }
 
@@ -22,12 +21,21 @@ export class Sidebar {
     if (!this.#isOpen) this.#set(true);
   }
 
+  /** Folds the settings away where they would hide what is shown. */
+  giveWay() {
+    if (!this.#isWide) this.#show(false);
+  }
+
+  get #isWide() {
+    return matchMedia(WIDE).matches;
+  }
+
   get #isOpen() {
     return this.#button.getAttribute("aria-expanded") === "true";
   }
 
   #set(isOpen) {
-    remember(KEY, isOpen ? "open" : CLOSED);
+    if (this.#isWide) remember(KEY, isOpen ? "open" : CLOSED);
     this.#show(isOpen);
   }
 

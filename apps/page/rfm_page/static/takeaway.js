@@ -51,9 +51,11 @@ export function json(url, curves, verdicts) {
     frame_times_s: curve.times,
     ...(curve.error ? { error: curve.error } : {}),
   }));
-  const comparisons = verdicts.map(({ videos, task, model, orient, channels, answer }) => ({
-    first: videos[0].name, second: videos[1].name, task, model, orient, channels, ...answer,
-  }));
+  const comparisons = verdicts.map(({ videos: compared, task, model, orient, channels, answer }) => {
+    const named = (each) => ({ ...each, first: compared[each.first].name, second: compared[each.second].name });
+    const ranked = answer.videos.map((each, index) => ({ source: compared[index].name, ...each }));
+    return { task, model, orient, channels, ...answer, videos: ranked, orders: answer.orders.map(named), pairs: answer.pairs.map(named) };
+  });
   return JSON.stringify({ servers: [url], videos, comparisons }, null, 2) + "\n";
 }
 
@@ -69,10 +71,7 @@ export function commands(url, curves, verdicts) {
     const target = `scores${groups.length > 1 ? `_${index + 1}` : ""}.json`;
     return line("score", group.map(({ video }) => video), group[0], url, [...sampling(rule, sampledFrames), "--json", target]);
   });
-  const comparisons = verdicts.flatMap((verdict) => [
-    line("compare", verdict.videos, verdict, url, []),
-    line("compare", [...verdict.videos].reverse(), verdict, url, []),
-  ]);
+  const comparisons = verdicts.map((verdict) => line("compare", verdict.videos, verdict, url, []));
   return [...scores, ...ofEpisodes, ...comparisons].join("\n");
 }
 
@@ -105,7 +104,7 @@ function labelLine(group, url) {
   const options = ["--episodes", origin.episode, "--cameras", cameras.join(","), ...corrections, ...sampling(rule, sampledFrames)];
   const given = task === origin.task ? [] : ["--task", task, "--override-task"];
   const words = ["rfm-client", "label", origin.dataset, ...serverOption(url), "--model", model, ...given, ...options];
-  const target = ["--output", `${origin.dataset}_episode_${origin.episode}`, "--format", "progress"];
+  const target = ["--output", `${origin.dataset.replace("/", "_")}_episode_${origin.episode}`, "--format", "progress"];
   return [...words, ...(resize ? ["--resize"] : []), ...target].map(quoted).join(" ");
 }
 

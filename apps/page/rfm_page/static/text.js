@@ -46,6 +46,6 @@ function reversed(text) {
 
 /** Writes a name into an element, which breaks lines between the words of the name. */
 export function writeName(element, name) {
-  const pieces = name.split(/(?<=[_\-/])/);
+  const pieces = name.split(/(?<=[_\-/…])|(?=\.)/);
   element.replaceChildren(...pieces.flatMap((piece, place) => (place ? [document.createElement("wbr"), piece] : [piece])));
 }

@@ -1,55 +1,76 @@
 // SPDX-License-Identifier: MIT
-// Which of two videos does a task better: the model is asked in both orders, and both answers are shown.
+// Which of several videos does a task best: the model is asked about each pair in both orders.
 
 import { colourName } from "./chart.js";
 import { shown } from "./text.js";
 
 const CHUNK_BYTES = 4 * 2 ** 20;
 
-/** What the model says of a pair, in one sentence. verdict: videos, task, model, and the gateway's answer; null: they are one file */
+/** What the model says of videos, in one sentence. verdict: videos, task, model, and the gateway's answer; null: two are one file */
 export function sentenceOf({ videos, answer }) {
   const [first, second] = videos.map(({ title }) => title);
   if (!answer) return `${first} and ${second} are one file, so neither is better.`;
-  if (answer.verdict) return `${answer.verdict === "first" ? first : second} does the task better.`;
-  return answer.orders_agree ? "No verdict: both answers are exactly 0.5." : "No verdict: the answer changes with the order.";
+  const best = answer.videos.findIndex(({ rank }) => rank === 1);
+  if (answer.pairs.every(({ verdict }) => verdict)) return `${videos[best].title} does the task ${videos.length > 2 ? "best" : "better"}.`;
+  const [{ orders_agree: agree }, ...others] = answer.pairs;
+  if (others.length) return `${best < 0 ? "No ranking" : `${videos[best].title} does the task best, but the others have no rank`}: some answers change with the order.`;
+  return agree ? "No verdict: both answers are exactly 0.5." : "No verdict: the answer changes with the order.";
 }
 
-/** Writes the verdict on a pair into `host`, with the sentence as its title, and returns the box. */
+/** Writes the verdict on videos into `host`, with the sentence as its title, and returns the box. */
 export function addVerdict(host, verdict) {
   const { videos, task, model, answer } = verdict;
   const box = document.createElement("div");
-  const about = answer ? `${task} (${model}).${answer.verdict ? " Both orders agree." : ""}` : "The files have the same bytes. The model was not asked.";
+  const agree = answer?.pairs.every(({ verdict: better }) => better) ? ` ${videos.length > 2 ? "All" : "Both"} orders agree.` : "";
+  const about = answer ? `${task} (${model}).${agree}` : "The files have the same bytes. The model was not asked.";
   box.className = "verdict";
   box.append(element("h2", sentenceOf(verdict).replace(/\.$/, "")), element("p", about));
   box.lastChild.className = "about";
-  if (answer) box.append(answersOf(videos, answer));
+  if (answer) box.append(rankingOf(videos, answer), pairsOf(videos, answer));
   host.append(box);
   return box;
 }
 
-/** Both answers, each as a number and a bar: how likely the better video is better, or the first one if none is. */
-function answersOf(videos, { orders, verdict }) {
-  const list = document.createElement("ul");
-  const better = verdict ?? "first";
-  const ordered = better === "first" ? videos : [...videos].reverse();
-  for (const { asked, preference } of orders) {
-    const [place, probability] = asked[0] === better ? ["first", preference] : ["second", 1 - preference];
-    const item = element("li", `P(${ordered[0].title} is better) = ${shown(probability)} (shown ${place})`);
-    const bar = document.createElement("span");
-    bar.className = "shares";
-    [probability, 1 - probability].forEach((share, index) => {
-      const part = bar.appendChild(document.createElement("span"));
-      part.style.width = `${100 * share}%`;
-      part.style.background = ordered[index].colour ?? `var(--${colourName(ordered[index].place)})`;
-    });
-    item.prepend(bar);
+/** The videos, best first, each with its name, and with the mean probability of winning as a bar and a number. */
+function rankingOf(videos, answer) {
+  const list = document.createElement("ol");
+  const ranked = videos.map((video, index) => ({ video, ...answer.videos[index] }));
+  for (const { video, wins, rank } of ranked.sort((one, other) => other.wins - one.wins)) {
+    const [item, bar, share] = ["li", "span", "span"].map((name) => document.createElement(name));
+    bar.className = "share";
+    share.style.width = `${100 * wins}%`;
+    share.style.background = video.colour ?? `var(--${colourName(video.place)})`;
+    bar.append(share);
+    item.append(element("span", `${rank ?? "?"} ${video.title}`), bar, element("span", `P(wins) = ${shown(wins)}`));
     list.append(item);
   }
   return list;
 }
 
+/** What the model answers about each pair, in both orders. */
+function pairsOf(videos, { orders, pairs }) {
+  const details = document.createElement("details");
+  details.append(element("summary", pairs.length > 1 ? "Pairs" : "Both orders"));
+  details.open = pairs.length === 1;
+  const asked = (first, second) => orders.find((each) => each.first === first && each.second === second).preference;
+  for (const { first, second, verdict } of pairs) {
+    const [better, other] = verdict === "second" ? [second, first] : [first, second];
+    const told = [`${shown(asked(better, other))} shown first`, `${shown(1 - asked(other, better))} shown second`];
+    details.append(element("p", `P(${videos[better].title} is better than ${videos[other].title}) = ${told.join(", ")}`));
+  }
+  return details;
+}
+
+/** The first two videos that are one file; null: there are none. */
+export async function ofOneFile(videos) {
+  for (const [place, one] of videos.entries()) {
+    for (const other of videos.slice(place + 1)) if (await areOneFile(one.file, other.file)) return [one, other];
+  }
+  return null;
+}
+
 /** Whether two files have the same bytes. */
-export async function areOneFile(one, other) {
+async function areOneFile(one, other) {
   if (one.size !== other.size) return false;
   for (let begin = 0; begin < one.size; begin += CHUNK_BYTES) {
     const [some, others] = await Promise.all([one, other].map(async (file) => {

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: MIT
+"""Rank trajectories by how well they do a task, from the preferences of a model.
+
+A model's preference may depend on the order of the two trajectories, so every pair is compared in both orders. If the
+orders disagree, the pair has no verdict.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from statistics import fmean
+from typing import TypeAlias, cast
+
+from rfm_client.contract.results import PreferenceResult, one_version
+
+Order: TypeAlias = tuple[int, int]  # indices of the first and second trajectory in a question
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Ranking:
+    """N trajectories, and their preferences from one model version.
+
+    results: for both orders of every pair, N * (N - 1)
+    """
+
+    results: Mapping[Order, PreferenceResult]
+
+    @cached_property
+    def numbers(self) -> range:
+        """Indices of the trajectories, from 0."""
+        return range(1 + max(first for first, _ in self.results))
+
+    @property
+    def model_version(self) -> str | None:
+        """The checkpoint version that answered. Raises InferenceFailedError for several."""
+        return one_version(self.results.values(), "all pairs")
+
+    def pair(self, first: int, second: int) -> PreferenceResult:
+        """Return both orders for two trajectories as one result."""
+        return PreferenceResult.of_both_orders(self.results[first, second], self.results[second, first])
+
+    def couples(self) -> Iterator[Order]:
+        """Yield every pair of trajectories once, in the given order."""
+        return itertools.combinations(self.numbers, 2)
+
+    @cached_property
+    def wins(self) -> list[float]:
+        """Each trajectory's mean probability of winning, averaged over opponents and orders."""
+        return [
+            fmean(self.pair(index, other).preference for other in self.numbers if other != index)
+            for index in self.numbers
+        ]
+
+    @cached_property
+    def ranks(self) -> list[int | None]:
+        """Each trajectory's rank by ``wins``, from 1; None if a pair with this trajectory has no verdict."""
+        best_first = sorted(self.numbers, key=self.wins.__getitem__, reverse=True)
+        unranked = {index for couple in self.couples() if self.pair(*couple).verdict is None for index in couple}
+        return [None if index in unranked else best_first.index(index) + 1 for index in self.numbers]
+
+    @property
+    def ranking(self) -> list[int] | None:
+        """The trajectories' indices, best first; None if a pair has no verdict."""
+        if None in self.ranks:
+            return None
+        return sorted(self.numbers, key=lambda index: cast(int, self.ranks[index]))
