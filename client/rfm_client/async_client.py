@@ -36,7 +36,6 @@ from rfm_client.episodes.scorer import Asked, StepScorer
 from rfm_client.episodes.steps import prefix_windows
 from rfm_client.frames.fit_to_checkpoint import resize_frames
 from rfm_client.frames.sampling import Sampling
-from rfm_client.scoring.batching import some_at_a_time
 from rfm_client.scoring.samples import Call, CallOptions, SampleScorer, results_of
 from rfm_client.transport.calls import Transport, TritonTransport
 from rfm_client.transport.connection import Credentials
@@ -169,7 +168,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         if info.by_digest and not trajectory.has_views:
             results = await self._steps.in_turn(prefix_windows(trajectory, rule), info, begin, go_on)
             return rule.joined(cast("list[ProgressResult]", results))
-        parts, results = some_at_a_time(rule.samples(trajectory)), []
+        parts, results = rule.parts(trajectory), []
         # in a thread, because copying many frames would block the event loop
         while part := await asyncio.to_thread(next, parts, None):
             go_on()

@@ -14,7 +14,7 @@ import pytest
 
 from labelling import BrightnessScorer, PickyScorer
 from rfm_client import UInt8Array
-from rfm_client.scoring import batching
+from rfm_client.frames import sampling
 from rfm_labels import Dataset, DatasetEpisode, LabelOptions, Report, label, scoring
 from rfm_labels.scoring import FrameMemory
 
@@ -26,7 +26,7 @@ WORKERS = 4
 @pytest.fixture(autouse=True)
 def small_requests(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make requests small beside a video, as in reality."""
-    monkeypatch.setattr(batching, "MAX_BYTES_IN_MEMORY", VIDEO_BYTES // 50)
+    monkeypatch.setattr(sampling, "MAX_BYTES", VIDEO_BYTES // 50)
 
 
 class LongVideos(Dataset):

@@ -18,7 +18,7 @@ from rfm_client import (
     Trajectory,
     UInt8Array,
 )
-from rfm_client.frames.sampling import Sampling
+from rfm_client.frames import Sampling
 from rfm_labels.datasets.stored_files import digest_of
 
 DECISIVE = ("weights_digest", "settings_digest", "computation")  # equal if the scores are

@@ -36,7 +36,6 @@ from rfm_client import (
 )
 from rfm_client.frames import BlankFrames
 from rfm_client.options import InvalidValueError
-from rfm_client.scoring.batching import some_at_a_time
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode
 from rfm_labels.metadata import SCORES, Columns
 from rfm_labels.options import Watch
@@ -238,7 +237,7 @@ def _scores(trajectory: Trajectory, scorer: Scorer, recipe: Recipe, go_on: Calla
         result = scorer.curve(trajectory, recipe.sampling, go_on)
     else:
         results: list[ProgressResult] = []
-        for together in some_at_a_time(recipe.sampling.samples(trajectory)):
+        for together in recipe.sampling.parts(trajectory):
             go_on()
             results += scorer.evaluate(together)
         result = recipe.sampling.joined(results)

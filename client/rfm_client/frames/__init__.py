@@ -7,7 +7,6 @@ The type aliases are ``Literal`` types: ``typing.get_args(Rule)`` lists the rule
 from rfm_client.contract.hub_access import cached_snapshot, hub_errors
 from rfm_client.frames.blank_frames import BlankFrames
 from rfm_client.frames.fit_to_checkpoint import resize_frames
-from rfm_client.frames.inputs import ARRAY_SUFFIXES
 from rfm_client.frames.orientation import ChannelOrder, Correction, Fuse, Orientation
 from rfm_client.frames.pictures import FrameFileError, Picture
 from rfm_client.frames.sampling import Rule, Sampling
@@ -15,7 +14,6 @@ from rfm_client.frames.video import frame_times_s, read_video
 from rfm_client.frames.video_file import Video
 
 __all__ = [
-    "ARRAY_SUFFIXES",
     "BlankFrames",
     "ChannelOrder",
     "Correction",

@@ -27,6 +27,8 @@ FrameIndices: TypeAlias = npt.NDArray[np.int64]
 RULES: tuple[Rule, ...] = get_args(Rule)
 REWIND_FRAMES = 16  # fixed in the first ReWiND code, for every checkpoint
 
+MAX_BYTES = 32 * 2**20  # of samples in memory: their frames are copies
+
 _REWIND: tuple[Rule, ...] = ("rewind_pad16_online", "rewind_pad16_offline")
 _PADDED: tuple[Rule, ...] = ("rint_pad", *_REWIND)  # filled up to K slots with the newest frame
 
@@ -117,6 +119,20 @@ class Sampling:
         """Yield a sample for every prefix, for t from 0 to T - 1. Raises InvalidSampleError."""
         for t in range(trajectory.num_frames):
             yield ProgressSample(taken(trajectory, self.prefix(t).indices))
+
+    def parts(self, trajectory: Trajectory) -> Iterator[list[ProgressSample]]:
+        """Yield the ``samples`` in lists that hold at most MAX_BYTES, or one sample. Raises InvalidSampleError."""
+        part: list[ProgressSample] = []
+        num_bytes = 0
+        for sample in self.samples(trajectory):
+            own = sum(array.nbytes for array in (sample.trajectory.positions, *sample.trajectory.views))
+            if part and num_bytes + own > MAX_BYTES:
+                yield part
+                part, num_bytes = [], 0
+            part.append(sample)
+            num_bytes += own
+        if part:
+            yield part
 
     def joined(self, results: Sequence[ProgressResult]) -> ProgressResult:
         """Return the episode's result: frame t takes its scores from prefix 0..t at the slot ``Prefix.read``.

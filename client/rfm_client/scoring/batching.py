@@ -3,28 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 
-from rfm_client.contract.samples import ProgressSample, Sample, stackable
+from rfm_client.contract.samples import Sample, stackable
 from rfm_client.contract.wire import frames_name
 
 MAX_REQUEST_BYTES = 8 * 2**20  # more gains nothing, because Triton batches requests
-MAX_BYTES_IN_MEMORY = 32 * 2**20  # of samples that are made as they are scored
-
-
-def some_at_a_time(samples: Iterable[ProgressSample]) -> Iterator[list[ProgressSample]]:
-    """Yield lists that hold at most MAX_BYTES_IN_MEMORY, or a single sample, as long as there are samples."""
-    together: list[ProgressSample] = []
-    num_bytes = 0
-    for sample in samples:
-        if together and num_bytes + sum(array_bytes(sample)) > MAX_BYTES_IN_MEMORY:
-            yield together
-            together, num_bytes = [], 0
-        together.append(sample)
-        num_bytes += sum(array_bytes(sample))
-    if together:
-        yield together
 
 
 def model_of(sample: Sample, model: str) -> str:
