@@ -9,8 +9,8 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection
-from contextlib import asynccontextmanager, nullcontext, suppress
+from collections.abc import Awaitable, Callable, Collection
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, TypeVar
 
@@ -132,8 +132,7 @@ class TritonTransport:
     async def close(self) -> None:
         try:
             if self._shared_memory is not None:
-                async with self._connected() as client:
-                    await self._shared_memory.close(client)
+                await self._answered(self._shared_memory.close)
         finally:
             for client in [*self._calls]:
                 await client.close()
@@ -153,8 +152,8 @@ class TritonTransport:
         """
         try:
             # One limit for gRPC and HTTP. Triton drops a cancelled gRPC call, unless scoring has begun.
-            async with timeout(timeout_s), self._connected() as client:
-                return await request(client)
+            async with timeout(timeout_s):
+                return await self._answered(request)
         except errors.RewardError:
             raise
         except Exception as raised:
@@ -168,21 +167,21 @@ class TritonTransport:
     async def _not_served(self, model: str, error: errors.ModelNotFoundError) -> errors.ModelNotFoundError:
         """Return the error with the served models' names, if the server lists them in time."""
         with suppress(Exception):
-            async with timeout(_SERVED_TIMEOUT_S), self._connected() as client:
-                statistics = await client.get_inference_statistics(**self.as_json)
+            async with timeout(_SERVED_TIMEOUT_S):
+                statistics = await self._answered(lambda client: client.get_inference_statistics(**self.as_json))
                 served = {each["name"] for each in statistics.get("model_stats", [])}
                 return triton.not_served(model, error.message, served)
         return error
 
-    @asynccontextmanager
-    async def _connected(self) -> AsyncIterator[Any]:
-        """Lend the client to a call. If the call is cancelled on a silent connection, later calls get a new one."""
+    async def _answered(self, request: Callable[[Any], Awaitable[Answered]]) -> Answered:
+        """Return ``request``'s answer. If it is cancelled on a silent connection, later calls get a new one."""
         client = self._client = self._client or self._open()
         self._calls[client] += 1
         self._silent_since_s.setdefault(client, time.monotonic())
         try:
-            yield client
+            answer = await request(client)
             self._silent_since_s.pop(client, None)
+            return answer
         except InferenceServerException:  # an answer, or gRPC has noticed that the connection ended
             self._silent_since_s.pop(client, None)
             raise

@@ -67,7 +67,7 @@ class GrpcClient(InferenceServerClient):  # type: ignore[misc]  # untyped
         except RpcError as error:
             raise InferenceServerException(error.details(), str(error.code())) from None
         arrays = {
-            output.name: np.frombuffer(content, triton_to_np_dtype(output.datatype)).reshape(output.shape)
+            output.name: np.frombuffer(content, triton_to_np_dtype(output.datatype)).reshape(tuple(output.shape))
             for output, content in zip(response.outputs, response.raw_output_contents, strict=True)
         }
         return arrays, response.model_version
