@@ -10,9 +10,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from grpc import RpcError
-from tritonclient.grpc import service_pb2
-from tritonclient.grpc.aio import InferenceServerClient
+from tritonclient.grpc import aio, service_pb2
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype, serialize_byte_tensor, triton_to_np_dtype
 
 from rfm_client.contract.wire import Tensors
@@ -27,7 +25,7 @@ _HEADS = 256  # how many requests' heads to keep
 Input: TypeAlias = tuple[str, tuple[int, ...], "np.dtype[Any]", str]  # name, shape, dtype, and region or nothing
 
 
-class GrpcClient(InferenceServerClient):  # type: ignore[misc]  # untyped
+class GrpcClient(aio.InferenceServerClient):  # type: ignore[misc]  # untyped
     """A connection to one server, for one event loop. The caller has a deadline.
 
     Unlike the base class, this client copies each tensor into the request once, instead of three times, and makes the
@@ -64,7 +62,7 @@ class GrpcClient(InferenceServerClient):  # type: ignore[misc]  # untyped
         request = await off_loop(sum(array.nbytes for array in sent), _request, head, sent)
         try:
             response = await self._model_infer(request, metadata=self._get_metadata(None))
-        except RpcError as error:
+        except aio.grpc.RpcError as error:  # of the grpc that tritonclient brings
             raise InferenceServerException(error.details(), str(error.code())) from None
         arrays = {
             output.name: np.frombuffer(content, triton_to_np_dtype(output.datatype)).reshape(tuple(output.shape))
