@@ -18,18 +18,22 @@ import grpc
 import numpy as np
 import pytest
 from tritonclient.grpc import service_pb2
+from tritonclient.utils import deserialize_bytes_tensor
 
 from rfm_client import (
     DeadlineExceededError,
     InferenceFailedError,
     InvalidSampleError,
+    ProgressSample,
     RewardClient,
     RewardError,
     ServerUnavailableError,
     Trajectory,
 )
+from rfm_client.contract import wire
 from rfm_client.contract.triton import error_of, invalid_sample
 from rfm_client.serving import Credentials, ServerStatus
+from rfm_client.transport.calls import TritonTransport
 from rfm_client.transport.connection import grpc_options
 from rfm_client.transport.limits import MAX_BYTES, ConcurrencyLimiter, Deadline, check_size
 from trajectories import random_trajectory
@@ -198,6 +202,35 @@ def test_requests_to_triton_carry_the_timeout_of_the_call_in_microseconds() -> N
         client.progress(random_trajectory(0, 2), timeout_s=WITHIN_S)
     (waits_us,) = told_us
     assert 0.5 * WITHIN_S < waits_us / 1e6 <= WITHIN_S
+
+
+@pytest.mark.parametrize("side_px", [5, 60, 840], ids=["length of 2 bytes", "3 bytes", "4 bytes"])
+def test_a_grpc_request_holds_every_tensor_whole(side_px: int) -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (1, side_px, 2 * side_px, 3), np.uint8)[:, :, ::2]
+    sent: list[service_pb2.ModelInferRequest] = []
+
+    def infer(request: service_pb2.ModelInferRequest, context: grpc.ServicerContext) -> None:
+        sent.append(request)
+        context.abort(grpc.StatusCode.INVALID_ARGUMENT, "enough")
+
+    async def ask(port: int) -> None:
+        transport = TritonTransport(f"grpc://127.0.0.1:{port}")
+        for number in (1, 2):  # the second request begins as the first
+            with pytest.raises(InvalidSampleError, match="enough"):
+                await transport.infer("m", inputs, ("progress",), WITHIN_S, request_id=f"id-{number}")
+        await transport.close()
+
+    inputs = wire.encode_samples([ProgressSample(Trajectory(frames=frames, task="öffne"))])
+    handler = grpc.unary_unary_rpc_method_handler(infer, service_pb2.ModelInferRequest.FromString)
+    with grpc_server("inference.GRPCInferenceService", "ModelInfer", handler) as port:
+        asyncio.run(ask(port))
+    assert [(request.id, request.model_name) for request in sent] == [("id-1", "m"), ("id-2", "m")]
+    for request in sent:
+        assert [output.name for output in request.outputs] == ["progress"]
+        assert [(each.name, tuple(each.shape)) for each in request.inputs] == [(n, a.shape) for n, a in inputs.items()]
+        *contents, text = request.raw_input_contents
+        assert contents == [array.tobytes() for name, array in inputs.items() if name != wire.TASK]
+        assert deserialize_bytes_tensor(text).tolist() == ["öffne".encode()]
 
 
 def test_the_error_for_an_unknown_host_name_says_so() -> None:

@@ -19,7 +19,7 @@ from rfm_client.options import counted
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset
 from rfm_labels.datasets.faults import DatasetError
 from rfm_labels.label_files import LabelFile
-from rfm_labels.metadata import PROGRESS, SCORES, blank_from_metadata, blank_lines, skipping_in
+from rfm_labels.metadata import PROGRESS, SCORES, blank_from_metadata, blank_lines, skipping_in, values_of
 from rfm_labels.options import DEFAULTS, QUIET, LabelOptions, Watch
 from rfm_labels.plan import Plan, checked_episodes, part_key, plan_labels
 from rfm_labels.scorer import Scorer
@@ -99,10 +99,10 @@ def put_together(
         watch.note(line)
     files = outputs.write(plan, labels)
     for name, score in SCORES.items():
-        if name in labels.column_names and (note := score.mark_note(labels[name].to_numpy())):
+        if name in labels.column_names and (note := score.mark_note(values_of(labels[name]))):
             watch.note(f"{note}; the column {name} marks them")
     if outputs.progress and skipping_in(labels.column_names):
-        skipped = np.isnan(labels[PROGRESS].to_numpy()).sum()
+        skipped = np.isnan(values_of(labels[PROGRESS])).sum()
         watch.note(f"progress_sparse: filled at the {skipped} of {len(labels)} frames that the model skipped")
     num_episodes = len(dataset.numbers)
     if len(plan.items) < num_episodes:

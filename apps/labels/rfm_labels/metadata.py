@@ -7,6 +7,9 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeAlias
 
+import numpy as np
+import numpy.typing as npt
+
 from rfm_client import FRAME_SCORES, Float32Array
 from rfm_client.frames import BlankFrames
 from rfm_labels.datasets.faults import listed
@@ -18,6 +21,14 @@ BlankCameras: TypeAlias = Mapping[str, Mapping[int, int]]  # brightest value, by
 BLANK_KEY = b"rfm.blank_cameras"
 
 _MOST_LISTED = 12  # episode ranges per line
+
+
+def values_of(column: Any) -> npt.NDArray[Any]:
+    """Return a pyarrow column's values, as its ``to_numpy`` does, but without importing pandas for plain numbers."""
+    from pyarrow import types
+
+    is_plain = not column.null_count and (types.is_integer(column.type) or types.is_floating(column.type))
+    return np.from_dlpack(column.combine_chunks()) if is_plain else column.to_numpy()
 
 
 def skipping_in(names: Iterable[str]) -> str | None:

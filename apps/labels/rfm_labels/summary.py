@@ -15,7 +15,7 @@ from rfm_client import Float32Array
 from rfm_client.episodes import SuccessRule
 from rfm_labels.datasets.faults import named, require
 from rfm_labels.label_files import read_label_table, read_names
-from rfm_labels.metadata import PROGRESS, SUCCESS
+from rfm_labels.metadata import PROGRESS, SUCCESS, values_of
 
 BACKWARDS_BY = 0.01  # kappa in reward-aligned behaviour cloning; a smaller fall is noise
 VOTING_FRAMES = 3  # at an episode's end: a single frame may be an accident
@@ -92,20 +92,20 @@ def summarise(file: Path) -> Summary:
 
 def summary_of(labels: Any, names: Mapping[int, str]) -> Summary:
     """Summarise labels, a pyarrow Table with the parts' column names. names: as in ``Summary``"""
-    episodes = labels["episode_index"].to_numpy()
+    episodes = values_of(labels["episode_index"])
     starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1)).tolist()
     numbers, final, best, last, voted, backwards, apart = [], [], [], [], [], [], []
     for start, end in zip(starts, [*starts[1:], len(labels)], strict=True):
         table = labels.slice(start, end - start)
-        progress = table[PROGRESS].to_numpy()
+        progress = values_of(table[PROGRESS])
         is_scored = np.isfinite(progress)  # NaN: the model did not answer
         final.append(progress[-1])
         progress = progress[is_scored]
-        cameras = [table[name].to_numpy()[is_scored] for name in table.column_names if name.startswith(f"{PROGRESS}.")]
+        cameras = [values_of(table[name])[is_scored] for name in table.column_names if name.startswith(f"{PROGRESS}.")]
         numbers.append(episodes[start])
         backwards.append(np.mean(np.diff(progress) < -BACKWARDS_BY) if len(progress) > 1 else 0.0)
         if SUCCESS in table.column_names:
-            success = table[SUCCESS].to_numpy()
+            success = values_of(table[SUCCESS])
             best.append(success.max())
             last.append(success[-1])
             voted.append(voted_success(success))

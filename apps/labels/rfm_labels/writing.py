@@ -41,6 +41,7 @@ from rfm_labels.metadata import (
     blank_to_metadata,
     canonical_json,
     skipping_in,
+    values_of,
 )
 from rfm_labels.plan import Item, Plan
 
@@ -282,18 +283,18 @@ def _with_totals(labels: Any, plan: Plan) -> Any:
 
     derived = {}
     if REMAINING in labels.column_names:
-        seconds = labels[REMAINING].to_numpy()
+        seconds = values_of(labels[REMAINING])
         derived = {_POTENTIAL: -seconds, _IS_SCORED: np.ones_like(seconds)}
     skipping = skipping_in(labels.column_names)
     if skipping is not None:
-        derived[_IS_SCORED] = np.isfinite(labels[skipping].to_numpy()).astype(np.float32)
+        derived[_IS_SCORED] = np.isfinite(values_of(labels[skipping])).astype(np.float32)
     for name, values in derived.items():
         labels = labels.append_column(name, pa.array(values))
     if plan.horizon is not None:
-        labels = labels.append_column(_ADVANTAGE, pa.array(_advantages(labels[PROGRESS].to_numpy(), plan)))
+        labels = labels.append_column(_ADVANTAGE, pa.array(_advantages(values_of(labels[PROGRESS]), plan)))
     if not (skipping or _has_several_tasks(plan)):
         return labels
-    progress = labels[PROGRESS].to_numpy()
+    progress = values_of(labels[PROGRESS])
     total, begin = progress.copy(), 0
     for item in plan.items:
         end = begin + item.episode.num_frames
@@ -402,7 +403,8 @@ def write_labels(labels: Any, plan: Plan, progress: Sequence[Path], signals: Seq
         for file, (path, (named, metadata)) in zip(files, forms, strict=True):
             own = labels.select([*IDENTITY, *named]).rename_columns([*IDENTITY, *named.values()])
             fields = [pa.field(field.name, field.type, nullable=False) for field in own.schema]
-            table = own.cast(pa.schema(fields, metadata={**metadata, **shared}))
+            schema = pa.schema(fields, metadata={**metadata, **shared})
+            table = pa.Table.from_arrays(own.columns, schema=schema)  # a cast would import pyarrow.compute
             parquet.write_table(table, file, row_group_size=_ROWS_AT_A_TIME)
             if not _holds(file, table):
                 raise OSError(f"{path}: expected the labels that were written, read others")
@@ -419,5 +421,5 @@ def _holds(file: Path, table: Any) -> bool:
         return False
     pairs = zip(read.columns, table.columns, strict=False)
     return read.schema.equals(table.schema, check_metadata=True) and all(
-        np.array_equal(one.to_numpy(), other.to_numpy(), equal_nan=True) for one, other in pairs
+        np.array_equal(values_of(one), values_of(other), equal_nan=True) for one, other in pairs
     )

@@ -116,22 +116,20 @@ class Trajectory:
             object.__setattr__(self, "goal", _checked_goal(self.goal))
 
 
-class _Sample:
-    @property
-    def trajectories(self) -> tuple[Trajectory, ...]:
-        """The trajectories, in their order on the time axis."""
-        return tuple(each for each in vars(self).values() if isinstance(each, Trajectory))
-
-
-class _Pair(_Sample):
+class _Pair:
     def __post_init__(self) -> None:
         (where, first), (other_where, other) = vars(self).items()
         _check_text(first, where)
         _check_pair(first, other, other_where)
 
+    @property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """Both trajectories, in their order on the time axis."""
+        return tuple(vars(self).values())
+
 
 @dataclass(frozen=True, eq=False)
-class ProgressSample(_Sample):
+class ProgressSample:
     """Question: how far is ``trajectory`` at each frame, and has it succeeded?
 
     frame_steps: 0 scores the trajectory as a whole. N >= 2 is dense mode: frame t is scored from its prefix 0..t alone,
@@ -148,6 +146,11 @@ class ProgressSample(_Sample):
         is_valid = is_whole and (steps == 0 or MIN_FRAME_STEPS <= steps <= MAX_FRAME_STEPS)
         expected = f"0 or a whole number from {MIN_FRAME_STEPS} to {MAX_FRAME_STEPS}"
         require("frame_steps", is_valid, expected, repr(steps), InvalidSampleError)
+
+    @property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """The trajectory alone, as a pair has two."""
+        return (self.trajectory,)
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,6 +29,9 @@ def groups(samples: Mapping[int, Sample], model: str) -> Iterator[tuple[str, lis
         text = first.text_embedding
         return model_of(samples[index], model), shapes, () if text is None else text.shape
 
+    if len(samples) == 1:
+        yield from ((model_of(sample, model), [index]) for index, sample in samples.items())
+        return
     by_length = sorted(samples, key=lambda index: (key(index), num_positions(samples[index])))
     for (name, *_), group in groupby(by_length, key=key):
         yield name, list(group)

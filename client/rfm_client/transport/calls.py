@@ -9,24 +9,21 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
-from contextlib import asynccontextmanager, nullcontext, suppress
+from collections.abc import Awaitable, Callable, Collection
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
-from functools import cached_property
-from importlib import import_module
 from typing import Any, ClassVar, Protocol, TypeVar
 
-from tritonclient.utils import InferenceServerException, np_to_triton_dtype
+from tritonclient.utils import InferenceServerException
 
 from rfm_client.contract import errors, triton
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.wire import Tensors
-from rfm_client.transport.connection import SECURE_SCHEMES, SILENT_S, Credentials, grpc_options
+from rfm_client.transport.connection import SECURE_SCHEMES, SILENT_S, Credentials
 from rfm_client.transport.limits import check_size, timeout
-from rfm_client.transport.shared_memory import Region, SharedMemory
-from rfm_client.transport.threads import off_loop
+from rfm_client.transport.shared_memory import SharedMemory
 
 Answered = TypeVar("Answered")
 
@@ -91,14 +88,9 @@ class TritonTransport:
         self._silent_since_s: dict[Any, float] = {}  # by client: its first call since the last answer
         self._is_triton = self._is_grpc  # False: may be the metrics port
 
-    @cached_property
-    def _triton(self) -> Any:
-        return import_module("tritonclient.grpc.aio" if self._is_grpc else "tritonclient.http")
-
     async def infer(
         self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
     ) -> Answer:
-        requested = [self._triton.InferRequestedOutput(name) for name in outputs]
         # If the export sets queue_timeout_ms, Triton drops requests that wait longer in its queue, over HTTP too.
         waits_us = max(int(timeout_s * _US_PER_S), 1)
         largest = max(inputs, key=lambda name: inputs[name].nbytes)
@@ -108,12 +100,11 @@ class TritonTransport:
             async with lent as region:
                 regions = {largest: region} if region is not None else {}
                 check_size(inputs, regions)
-                num_bytes = 0 if regions else inputs[largest].nbytes
-                tensors = await off_loop(num_bytes, self._inputs, inputs, regions)
-                answer = await client.infer(model, tensors, outputs=requested, request_id=request_id, timeout=waits_us)
-            response = answer.get_response()
-            version = response["model_version"] if isinstance(response, dict) else response.model_version
-            return Answer(_outputs(answer, outputs), str(version))
+                arrays, version = await client.score(model, inputs, regions, outputs, request_id, waits_us)
+            absent = [name for name in outputs if name not in arrays]
+            if absent:
+                raise errors.InferenceFailedError(f"outputs: expected {', '.join(outputs)}, got no {', '.join(absent)}")
+            return Answer(arrays, version)
 
         return await self.call(request, timeout_s, model=model)
 
@@ -141,22 +132,10 @@ class TritonTransport:
     async def close(self) -> None:
         try:
             if self._shared_memory is not None:
-                async with self._connected() as client:
-                    await self._shared_memory.close(client)
+                await self._answered(self._shared_memory.close)
         finally:
             for client in [*self._calls]:
                 await client.close()
-
-    def _inputs(self, inputs: Tensors, regions: Mapping[str, Region]) -> list[Any]:
-        tensors = []
-        for name, array in inputs.items():
-            tensor = self._triton.InferInput(name, array.shape, np_to_triton_dtype(array.dtype))
-            if name in regions:
-                tensor.set_shared_memory(regions[name].name, array.nbytes)
-            else:
-                tensor.set_data_from_numpy(array)
-            tensors.append(tensor)
-        return tensors
 
     async def call(
         self,
@@ -173,8 +152,8 @@ class TritonTransport:
         """
         try:
             # One limit for gRPC and HTTP. Triton drops a cancelled gRPC call, unless scoring has begun.
-            async with timeout(timeout_s), self._connected() as client:
-                return await request(client)
+            async with timeout(timeout_s):
+                return await self._answered(request)
         except errors.RewardError:
             raise
         except Exception as raised:
@@ -188,21 +167,21 @@ class TritonTransport:
     async def _not_served(self, model: str, error: errors.ModelNotFoundError) -> errors.ModelNotFoundError:
         """Return the error with the served models' names, if the server lists them in time."""
         with suppress(Exception):
-            async with timeout(_SERVED_TIMEOUT_S), self._connected() as client:
-                statistics = await client.get_inference_statistics(**self.as_json)
+            async with timeout(_SERVED_TIMEOUT_S):
+                statistics = await self._answered(lambda client: client.get_inference_statistics(**self.as_json))
                 served = {each["name"] for each in statistics.get("model_stats", [])}
                 return triton.not_served(model, error.message, served)
         return error
 
-    @asynccontextmanager
-    async def _connected(self) -> AsyncIterator[Any]:
-        """Lend the client to a call. If the call is cancelled on a silent connection, later calls get a new one."""
+    async def _answered(self, request: Callable[[Any], Awaitable[Answered]]) -> Answered:
+        """Return ``request``'s answer. If it is cancelled on a silent connection, later calls get a new one."""
         client = self._client = self._client or self._open()
         self._calls[client] += 1
         self._silent_since_s.setdefault(client, time.monotonic())
         try:
-            yield client
+            answer = await request(client)
             self._silent_since_s.pop(client, None)
+            return answer
         except InferenceServerException:  # an answer, or gRPC has noticed that the connection ended
             self._silent_since_s.pop(client, None)
             raise
@@ -231,16 +210,6 @@ class TritonTransport:
                 f"gRPC was used in process {process}, which forked this one: "
                 "have multiprocessing start its processes by spawn or forkserver"
             )
-        client = self._triton.InferenceServerClient(
-            self._address, channel_args=grpc_options(self._address), **self._credentials.grpc_options(self._scheme)
-        )
-        self._credentials.show_with_each_request(client)
-        return client
+        from rfm_client.transport.grpc import GrpcClient
 
-
-def _outputs(answer: Any, names: Collection[str]) -> Tensors:
-    arrays = {name: answer.as_numpy(name) for name in names}
-    absent = [name for name, array in arrays.items() if array is None]
-    if absent:
-        raise errors.InferenceFailedError(f"outputs: expected {', '.join(names)}, got no {', '.join(absent)}")
-    return arrays
+        return GrpcClient(self._scheme, self._address, self._credentials)

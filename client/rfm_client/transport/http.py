@@ -5,17 +5,20 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from http import HTTPStatus
 from typing import Any
 from urllib.parse import urljoin
 
+from tritonclient.http import InferInput, InferRequestedOutput
 from tritonclient.http.aio import InferenceServerClient
-from tritonclient.utils import InferenceServerException
+from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 from rfm_client.contract.errors import InferenceFailedError
+from rfm_client.contract.wire import Tensors
 from rfm_client.transport.connection import SECURE_SCHEMES, Credentials
-from rfm_client.transport.threads import MIN_BYTES
+from rfm_client.transport.shared_memory import Region
+from rfm_client.transport.threads import MIN_BYTES, off_loop
 
 _REDIRECTS = range(300, 400)
 _AS_IT_IS = {"Accept-Encoding": "identity"}  # otherwise aiohttp asks for gzip, which hardly shrinks floats
@@ -33,6 +36,25 @@ class HttpClient(InferenceServerClient):  # type: ignore[misc]  # untyped
         context = credentials.ssl_context if is_secure else None
         super().__init__(address, conn_limit=0, conn_timeout=None, ssl=is_secure, ssl_context=context)
         self._own_headers = {**_AS_IT_IS, **credentials.shown}
+
+    async def score(
+        self,
+        model: str,
+        inputs: Tensors,
+        regions: Mapping[str, Region],
+        outputs: Collection[str],
+        request_id: str,
+        waits_us: int,
+    ) -> tuple[Tensors, str]:
+        """Return the named outputs that the model gave, and its version, as ``GrpcClient.score`` does."""
+        requested = [InferRequestedOutput(name) for name in outputs]
+        num_bytes = sum(array.nbytes for name, array in inputs.items() if name not in regions)
+        tensors = await off_loop(num_bytes, _tensors, inputs, regions)
+        answer = await self.infer(model, tensors, outputs=requested, request_id=request_id, timeout=waits_us)
+        arrays = {name: answer.as_numpy(name) for name in outputs}
+        return {name: array for name, array in arrays.items() if array is not None}, answer.get_response()[
+            "model_version"
+        ]
 
     async def _get(self, request_uri: str, headers: Mapping[str, Any] | None, query_params: None) -> Any:
         return await self._ask("GET", request_uri, b"", headers)
@@ -65,6 +87,18 @@ class HttpClient(InferenceServerClient):  # type: ignore[misc]  # untyped
         if answer.status != HTTPStatus.OK and not path.endswith("/ready"):
             raise _error(self._url, answer.status, content)
         return answer
+
+
+def _tensors(inputs: Tensors, regions: Mapping[str, Region]) -> list[InferInput]:
+    tensors = []
+    for name, array in inputs.items():
+        tensor = InferInput(name, array.shape, np_to_triton_dtype(array.dtype))
+        if name in regions:
+            tensor.set_shared_memory(regions[name].name, array.nbytes)
+        else:
+            tensor.set_data_from_numpy(array)
+        tensors.append(tensor)
+    return tensors
 
 
 def _error(url: str, status: int, content: bytes) -> Any:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -33,13 +34,17 @@ def outputs_for(samples: Sequence[Sample], given: Collection[str] = (), *, all_s
     """
     kinds = set(map(type, samples))
     asked_by = {PREFERENCE: PreferenceSample, SIMILARITY: SimilaritySample}
-    of_frames = [
+    return (*_frame_outputs(tuple(given), all_scores), *(name for name, kind in asked_by.items() if kind in kinds))
+
+
+@lru_cache
+def _frame_outputs(given: tuple[str, ...], all_scores: bool) -> tuple[str, ...]:
+    return tuple(
         name
         for name, score in FRAME_SCORES.items()
         if score.asked == "always"
         or (name in given and (score.asked == "if given" or (all_scores and not score.is_per_bin)))
-    ]
-    return (*of_frames, *(name for name, kind in asked_by.items() if kind in kinds))
+    )
 
 
 def encode_results(results: Sequence[Result], num_positions: int, outputs: Collection[str]) -> Tensors:
@@ -63,7 +68,7 @@ def decode_progress(
     tensors: Mapping[str, npt.NDArray[Any]], row: int, num_frames: int, model_version: str | None = None
 ) -> ProgressResult:
     """Return the result for the progress sample in ``row``, with ``num_frames``. Raises InferenceFailedError."""
-    scores = vars(_scores_between(tensors, row, slice(0, num_frames)))
+    scores = _scores_between(tensors, row, slice(0, num_frames))
     return ProgressResult(**scores, timing=_timing(tensors, row), model_version=model_version)
 
 
@@ -86,8 +91,8 @@ def _decode_result(
     num_first, *num_second = (trajectory.num_frames for trajectory in sample.trajectories)
     if isinstance(sample, ProgressSample):
         return decode_progress(tensors, row, num_first, model_version)
-    first = _scores_between(tensors, row, slice(0, num_first))
-    second = _scores_between(tensors, row, slice(num_first, num_first + sum(num_second)))
+    first = FrameScores(**_scores_between(tensors, row, slice(0, num_first)))
+    second = FrameScores(**_scores_between(tensors, row, slice(num_first, num_first + sum(num_second))))
     of_request: dict[str, Any] = {"timing": _timing(tensors, row), "model_version": model_version}
     if isinstance(sample, PreferenceSample):
         preference = float(_present(tensors, PREFERENCE, row, slice(0, 1))[0])
@@ -100,7 +105,8 @@ def _timing(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> BatchTiming | 
     return BatchTiming(*tensors[TIMING_MS][row].tolist()) if TIMING_MS in tensors else None
 
 
-def _scores_between(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions: slice) -> FrameScores:
+def _scores_between(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions: slice) -> dict[str, Any]:
+    """Return the fields of a FrameScores. Raises InferenceFailedError."""
     skipping = next((name for name, score in FRAME_SCORES.items() if score.skips_frames and name in tensors), None)
     given: dict[str, Any] = {
         name: _present(
@@ -114,7 +120,7 @@ def _scores_between(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions
         for name, score in FRAME_SCORES.items()
         if name in tensors or score.asked == "always"
     }
-    return FrameScores(**{name: part > 0 if FRAME_SCORES[name].mark else part for name, part in given.items()})
+    return {name: part > 0 if FRAME_SCORES[name].mark else part for name, part in given.items()}
 
 
 def _present(
