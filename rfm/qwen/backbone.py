@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The forward pass of the Qwen backbones, with the layers of ``transformers``, without synchronisation.
+"""The forward pass of the Qwen backbones, on the parameters of ``transformers``, without synchronisation.
 
 The host computes all positions and indices beforehand and never waits for the device, so the device always has work.
 Results and summation order match ``transformers`` 4.57.
