@@ -62,18 +62,18 @@ class RmsNorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Float [..., D] -> [..., D]."""
-        return self.weight * F.rms_norm(x, self.weight.shape, None, self.eps)
+        return self.weight * F.rms_norm(x, self.weight.shape[-1:], None, self.eps)
 
 
 def speed_up(network: nn.Module) -> None:
     """Replace layers by faster ones with the same parameters.
 
-    Every ``nn.Linear`` becomes a ``Linear``. On devices other than the CPU, ``RmsNorm`` replaces transformers'
+    On the CPU, ``Linear`` replaces every float32 ``nn.Linear``. On other devices, ``RmsNorm`` replaces transformers'
     RMSNorms; on the CPU ``F.rms_norm`` is slower in bfloat16.
     """
     for module in network.modules():
         for name, child in module.named_children():
-            if type(child) is nn.Linear:
+            if type(child) is nn.Linear and child.weight.is_cpu and child.weight.dtype is torch.float32:
                 with torch.device("meta"):
                     faster = Linear(child.in_features, child.out_features, child.bias is not None)
                 faster.weight, faster.bias = child.weight, child.bias
@@ -90,10 +90,10 @@ def is_rms_norm(module: nn.Module) -> bool:
 def _by_onednn(x: Tensor, weight: Tensor, bias: Tensor | None) -> bool:
     """True if oneDNN computes the product: it computes no gradients, and needs a contiguous bias."""
     return (
-        x.device.type == "cpu"
+        x.is_cpu
         and x.dtype is torch.float32
         and weight.dtype is torch.float32
-        and x.numel() * len(weight) >= WORTH_ONEDNN
+        and x.numel() * weight.shape[0] >= WORTH_ONEDNN
         and (bias is None or bias.is_contiguous())
         and not torch.is_grad_enabled()
         and torch.backends.mkldnn.is_available()

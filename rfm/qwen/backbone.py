@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The forward pass of the Qwen backbones, with the layers of ``transformers``, without synchronisation.
+"""The forward pass of the Qwen backbones, on the parameters of ``transformers``, without synchronisation.
 
 The host computes all positions and indices beforehand and never waits for the device, so the device always has work.
 Results and summation order match ``transformers`` 4.57.
@@ -16,7 +16,6 @@ adjacent. Shots with equal sizes share a call; transformers computes them one by
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -29,6 +28,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from rfm.engine.layers import concatenated
+from rfm.qwen.decoder_layer import Cache, DecoderLayer, decoder_layers, turn_of
 from rfm.qwen.images import MERGE, Grid
 
 
@@ -127,14 +127,17 @@ def features(visual: Any, patches: Tensor, plan: VisionPlan) -> Tensor:
     if plan.corners is not None and plan.weights is not None:
         around = visual.pos_embed(plan.corners) * plan.weights.to(visual.pos_embed.weight.dtype)[..., None]
         hidden = hidden + _repeated(around[0] + around[1] + around[2] + around[3], plan.shots)
-    turn = _turn(visual.rotary_pos_emb.inv_freq, plan)
+    of_shots, of_windows = _runs(visual.rotary_pos_emb.inv_freq, plan)
     if plan.order is not None:
         hidden = _moved(hidden, plan.order)
     full = set(getattr(visual, "fullatt_block_indexes", range(len(visual.blocks))))
     deeper = list(getattr(visual, "deepstack_visual_indexes", ()))
     of_deeper = dict[int, Tensor]()
     for number, block in enumerate(visual.blocks):
-        hidden = hidden + _attention(block.attn, block.norm1(hidden), turn, plan, is_full=number in full)
+        x, is_moved = block.norm1(hidden), plan.order is not None and number in full
+        qkv = block.attn.qkv(_moved(x, plan.back) if is_moved else x)
+        mixed = _attention(block.attn, qkv, of_shots if number in full else of_windows)
+        hidden = hidden + block.attn.proj(_moved(mixed, plan.order) if is_moved else mixed)
         hidden = hidden + block.mlp(block.norm2(hidden))
         if number in deeper:
             at = deeper.index(number)
@@ -154,46 +157,51 @@ def embedded(projection: Any, patches: Tensor) -> Tensor:
     return F.linear(patches.to(weight.dtype), weight.flatten(1), projection.bias)
 
 
-def _attention(attention: Any, hidden: Tensor, turn: Tensor, plan: VisionPlan, *, is_full: bool) -> Tensor:
-    """Attend within shots (``is_full``) or windows, equal sizes in one call: [N, D] -> [N, D]."""
-    heads = attention.qkv(hidden).unflatten(1, (3, attention.num_heads, -1))
-    query, key = _turned(heads[:, :2], turn).unbind(1)
-    value = heads[:, 2]
-    is_moved = is_full and plan.order is not None
-    if is_moved:
-        query, key, value = (_moved(each, plan.back) for each in (query, key, value))
-    runs = plan.shots if is_full or plan.windows is None else plan.windows
-    counts = [count * length for count, length in runs]
-    parts = zip(runs, query.split(counts), key.split(counts), value.split(counts), strict=True)
-    mixed = concatenated([_within(*part, scale=attention.scaling) for part in parts])
-    return attention.proj(_moved(mixed, plan.order) if is_moved else mixed)
+@dataclass(frozen=True)
+class Run:
+    """Sequences with ``length`` patches each, and their rotary embedding.
 
-
-def _within(run: tuple[int, int], query: Tensor, key: Tensor, value: Tensor, *, scale: float) -> Tensor:
-    """Attend within equal sequences, ``run`` = (count, length): [N, heads, D / heads] -> [N, D]."""
-    query, key, value = (each.unflatten(0, run).transpose(1, 2) for each in (query, key, value))
-    return F.scaled_dot_product_attention(query, key, value, scale=scale).transpose(1, 2).flatten(2).flatten(0, 1)
-
-
-def _turned(heads: Tensor, turn: Tensor) -> Tensor:
-    """Rotate queries and keys, [N, 2, heads, D / heads], in float32; the result keeps the input dtype."""
-    cosine, sine = turn.unbind(1)
-    first, second = heads.chunk(2, dim=-1)
-    return (heads * cosine + torch.cat((second, first), dim=-1) * sine).to(heads.dtype)
-
-
-def _turn(frequencies: Tensor, plan: VisionPlan) -> Tensor:
-    """Return the rotary embedding, cosine and sine by patch, float32 [N, 2, 1, 1, D / heads].
-
-    The first half of the sines is negated, so queries and keys need no negation.
+    cosine, sine: float32 [count, 1, length, D / heads], or without the first two if all sequences have the same. The
+        first half of the sines is negated, so queries and keys need no negation.
     """
+
+    count: int
+    length: int
+    cosine: Tensor
+    sine: Tensor
+
+
+def _attention(attention: Any, qkv: Tensor, runs: Sequence[Run]) -> Tensor:
+    """Attend within the sequences, equal sizes in one call: [N, 3 D] -> [N, D]."""
+    parts = qkv.split([run.count * run.length for run in runs]) if len(runs) > 1 else [qkv]
+    return concatenated([_within(attention, *each) for each in zip(parts, runs, strict=True)])
+
+
+def _within(attention: Any, qkv: Tensor, run: Run) -> Tensor:
+    """Attend within equal sequences, with queries and keys turned in float32: [N, 3 D] -> [N, D]."""
+    heads = qkv.view(run.count, run.length, 3, attention.num_heads, -1).permute(2, 0, 3, 1, 4)
+    both, value = heads[:2], heads[2]
+    first, second = both.chunk(2, dim=-1)
+    turned = (both * run.cosine + torch.cat((second, first), dim=-1) * run.sine).to(qkv.dtype)
+    query, key = turned.unbind()
+    mixed = F.scaled_dot_product_attention(query, key, value, scale=attention.scaling)
+    return mixed.transpose(1, 2).reshape(len(qkv), -1)
+
+
+def _runs(frequencies: Tensor, plan: VisionPlan) -> tuple[list[Run], list[Run]]:
+    """Return the runs of shots and of windows; both are shots without windows."""
     angles = (plan.positions[..., None].to(frequencies.dtype) * frequencies).flatten(1)
     cosine, sine = angles.cos().float(), angles.sin().float()
-    of_sizes = torch.stack((torch.cat((cosine, cosine), dim=-1), torch.cat((-sine, sine), dim=-1)), dim=1)
-    of_patches = _repeated(of_sizes, plan.shots)
-    if plan.order is not None:
-        of_patches = _moved(of_patches, plan.order)
-    return of_patches[:, :, None, None]
+    turn = torch.stack((torch.cat((cosine, cosine), dim=-1), torch.cat((-sine, sine), dim=-1)))  # [2, sum of S, E]
+    parts = turn.split([length for _, length in plan.shots], dim=1)
+    of_shots = [Run(*shot, *part) for shot, part in zip(plan.shots, parts, strict=True)]
+    if plan.windows is None:
+        return of_shots, of_shots
+    of_patches = _moved(_repeated(turn.transpose(0, 1), plan.shots), plan.order)
+    parts = of_patches.split([count * length for count, length in plan.windows])
+    return of_shots, [
+        Run(*run, *part.unflatten(0, run).unsqueeze(1).unbind(3)) for run, part in zip(plan.windows, parts, strict=True)
+    ]
 
 
 def _repeated(of_sizes: Tensor, shots: Runs) -> Tensor:
@@ -261,7 +269,7 @@ ROOM = 16  # slots that KeyValues adds at a time
 
 
 class KeyValues:
-    """The keys and values of all tokens so far, layer by layer, with the interface of transformers' cache.
+    """A ``Cache`` of all tokens so far, layer by layer.
 
     A conversation has S slots, filled from the first. After the pass over the prompts, call ``place`` before the pass
     over each further token.
@@ -285,7 +293,7 @@ class KeyValues:
         num_slots = self._of_layers[0][0].shape[1]
         self._next = torch.arange(len(lengths), device=lengths.device) * num_slots + lengths
 
-    def update(self, keys: Tensor, values: Tensor, layer: int, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
+    def update(self, keys: Tensor, values: Tensor, layer: int) -> tuple[Tensor, Tensor]:
         """Add the keys and values of new tokens, [B, heads, L, D / heads], and return those of all tokens.
 
         Behind a conversation's own tokens, the result holds padding, forgotten tokens or zeros.
@@ -316,7 +324,7 @@ class Part:
         int64 [M], the visual tokens' indices among all B * L, and visual_features, int64 [M], their indices in
         ``features``
     features: [N / U, levels, D], the merged tokens of all shots; None: there are no visual tokens
-    key_values: transformers' cache that receives these tokens' keys and values; None: nothing is kept
+    cache: receives these tokens' keys and values; None: nothing is kept
     mask: returns which tokens each token sees; None: the earlier ones
     """
 
@@ -325,26 +333,20 @@ class Part:
         language: Any,
         inputs: dict[str, Tensor],
         features: Tensor | None = None,
-        key_values: Any = None,
+        cache: Cache | None = None,
         mask: Callable[[], Tensor | None] = lambda: None,
     ) -> None:
-        self._mask, self._deeper = mask, list[Tensor]()
+        self._cache, self._mask, self._deeper = cache, mask, list[Tensor]()
         self.states = language.embed_tokens(inputs["input_ids"])
         if features is not None:
             self._at, self._picked = inputs["visual_tokens"], inputs["visual_features"]
             merged, *self._deeper = features.unbind(1)
             self.states.flatten(0, 1).index_copy_(0, self._at, merged[self._picked].to(self.states.dtype))
-        self._turned = language.rotary_emb(self.states, inputs["position_ids"])
-        self._options = {}
-        if key_values is not None:
-            known = inspect.signature(language.layers[0].forward).parameters
-            cache = "cache" if "cache" in known else "past_key_values"  # transformers 5.x renamed the argument
-            self._options = {cache: key_values}
+        self._turn = turn_of(language, self.states, inputs["position_ids"])
 
-    def run(self, number: int, layer: Any) -> None:
+    def run(self, number: int, layer: DecoderLayer) -> None:
         """Run layer ``number`` on the tokens."""
-        states = layer(self.states, position_embeddings=self._turned, attention_mask=self._mask(), **self._options)
-        self.states = states[0] if isinstance(states, tuple) else states  # transformers 4.57 with Qwen2.5-VL
+        self.states = layer(self.states, self._turn, self._mask(), self._cache)
         if number < len(self._deeper):
             added = self._deeper[number][self._picked].to(self.states.dtype)
             self.states.flatten(0, 1).index_add_(0, self._at, added)
@@ -352,7 +354,7 @@ class Part:
 
 def run_layers(language: Any, *parts: Part) -> Tensor:
     """Run all layers on the parts in turn; return the states behind the final norm, [tokens, D]."""
-    for number, layer in enumerate(language.layers):
+    for number, layer in enumerate(decoder_layers(language)):
         for part in parts:
             part.run(number, layer)
     return language.norm(concatenated([part.states.flatten(0, 1) for part in parts]))

@@ -156,11 +156,11 @@ def graphed_hidden_state(graphs: Graphs, language: Any, inputs: dict[str, Tensor
 
 
 class TrunkKeyValues:
-    """The keys and values of one layer's trunks, with the interface of transformers' cache."""
+    """A ``Cache`` of one layer's trunks."""
 
     of_trunks: tuple[Tensor, ...] = ()
 
-    def update(self, keys: Tensor, values: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
+    def update(self, keys: Tensor, values: Tensor, layer: int) -> tuple[Tensor, Tensor]:
         """Keep the trunks' keys and values, [B, heads, L, D / heads], and return them."""
         self.of_trunks = keys, values
         return keys, values
@@ -168,12 +168,12 @@ class TrunkKeyValues:
 
 @dataclass(frozen=True)
 class PackKeyValues:
-    """The keys and values that tokens in a call may see, with the interface of transformers' cache."""
+    """A ``Cache`` for the tokens in a call, which see trunks and packs."""
 
     trunks: TrunkKeyValues
     packs: Packs
 
-    def update(self, keys: Tensor, values: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
+    def update(self, keys: Tensor, values: Tensor, layer: int) -> tuple[Tensor, Tensor]:
         """Return the packs' keys and values behind those of their trunks."""
         before = [each[self.packs.trunks, :, : self.packs.num_keys] for each in self.trunks.of_trunks]
         return torch.cat([before[0], keys], dim=2), torch.cat([before[1], values], dim=2)

@@ -18,6 +18,7 @@ from pretended import CUDA, pretended
 from rfm import published
 from rfm.engine import Engine
 from rfm.engine.layers import MKL_FUNCTIONS, WORTH_ONEDNN, Linear, RmsNorm, is_rms_norm, linear, speed_up
+from rfm.qwen.decoder_layer import decoder_layers, turn_of
 from vlm import PLAIN, load
 
 LARGE, SMALL = (512, 256), (32, 16)  # [N, K] on either side of WORTH_ONEDNN
@@ -131,6 +132,26 @@ def test_all_norms_are_replaced_on_a_device_and_none_on_the_cpu(name: str, monke
     assert sum(map(is_rms_norm, network.modules())) == 0
     assert sum(isinstance(module, RmsNorm) for module in network.modules()) == num_norms
     assert list(network.state_dict()) == names
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
+@pytest.mark.parametrize("name", [PLAIN, "q25_boundary_disc10"])
+@pytest.mark.parametrize("is_masked", [False, True], ids=["causal", "masked"])
+def test_decoder_layers_give_the_bits_of_transformers_layers(name: str, dtype: torch.dtype, is_masked: bool) -> None:
+    language: Any = load(name).build(dtype).eval().model.language_model
+    for parameter in language.parameters():
+        torch.nn.init.normal_(parameter.data, 0.5, 0.3)
+    states = torch.randn(2, 33, language.config.hidden_size).to(dtype)
+    position_ids = torch.randint(0, 40, (3, 2, 33))
+    mask = (torch.rand(2, 1, 33, 33) < 0.5) | torch.eye(33, dtype=torch.bool) if is_masked else None
+    with torch.inference_mode():
+        turn = turn_of(language, states, position_ids)
+        theirs = language.rotary_emb(states, position_ids)
+        for layer, ours in zip(language.layers, decoder_layers(language), strict=True):
+            expected = layer(states, position_embeddings=theirs, attention_mask=mask)
+            expected = expected[0] if isinstance(expected, tuple) else expected
+            assert torch.equal(ours(states, turn, mask, None), expected)
+    assert not [key for key in language.state_dict() if "_decoder_layers" in key]
 
 
 def test_the_first_calls_of_all_functions_of_mkl_are_made_by_one_thread() -> None:

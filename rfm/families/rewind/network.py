@@ -346,8 +346,10 @@ class RewindTransformer(nn.Module):
 
     def _query_scores(self, hidden: Tensor, batch: RewindBatch) -> Tensor:
         """Return logits [Q] from the query tokens' states [Q, D]."""
+        if not len(hidden):
+            return hidden[:, 0]
         if not self.config.has_preference:
-            return self.similarity_head(hidden).squeeze(-1) if self.config.has_similarity else hidden[:, 0]
+            return self.similarity_head(hidden).squeeze(-1)
         preference = self.preference_head(hidden).squeeze(-1)
         if batch.is_similarity is None:
             return preference
