@@ -91,7 +91,7 @@ USAGE = {
     f"rfm-client gateway --triton {NOBODY} --metrics-url nope": bad(
         "--metrics-url", "expected http://host:port/metrics, got 'nope'"
     ),
-    f"rfm-client gateway --triton {NOBODY} --dataset nope": bad("--dataset", f"{DATASET} nope"),
+    f"rfm-client gateway --triton {NOBODY} --dataset nope": bad("--dataset", f"nope: {DATASET} none"),
     "rfm-client label dataset --override-task": "Invalid value: --override-task needs --task",
     "rfm score a.mp4": "No such command 'score': that is `rfm-client score`",
     "rfm serve": "Invalid value: give FOLDER or --repository",
@@ -128,7 +128,7 @@ FAILURES = {
         *(1, "--grpc-certificate: expected client certificates (--grpc-client-ca) at 10.0.0.5, "),
         "since TLS alone asks for nothing, got none; --grpc-any-client serves everyone",
     ),
-    "rfm serve repository --gateway-port FREE_PORT --gateway-dataset nope": (1, f"--gateway-dataset: {DATASET} nope"),
+    "rfm serve repository --gateway-port FREE_PORT --gateway-dataset nope": (1, f"--gateway-dataset: nope: {DATASET} none"),
     "rfm serve repository --config mistake.yaml": (
         *(1, "mistake.yaml: expected a YAML file, got a mistake in line 2 "),
         "(expected the node content, but found '<stream end>')",
