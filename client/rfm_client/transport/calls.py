@@ -103,14 +103,21 @@ class TritonTransport:
         waits_us = max(int(timeout_s * _US_PER_S), 1)
         largest = max(inputs, key=lambda name: inputs[name].nbytes)
 
-        async def request(client: Any) -> Answer:
-            lent = nullcontext() if self._shared_memory is None else self._shared_memory.lend(client, inputs[largest])
-            async with lent as region:
+        async def ask(client: Any, memory: SharedMemory | None) -> Any:
+            async with nullcontext() if memory is None else memory.lend(client, inputs[largest]) as region:
                 regions = {largest: region} if region is not None else {}
                 check_size(inputs, regions)
                 num_bytes = 0 if regions else inputs[largest].nbytes
                 tensors = await off_loop(num_bytes, self._inputs, inputs, regions)
-                answer = await client.infer(model, tensors, outputs=requested, request_id=request_id, timeout=waits_us)
+                return await client.infer(model, tensors, outputs=requested, request_id=request_id, timeout=waits_us)
+
+        async def request(client: Any) -> Answer:
+            try:
+                answer = await ask(client, self._shared_memory)
+            except InferenceServerException as error:
+                if triton.LOST_REGION not in (error.message() or ""):
+                    raise
+                answer = await ask(client, None)
             response = answer.get_response()
             version = response["model_version"] if isinstance(response, dict) else response.model_version
             return Answer(_outputs(answer, outputs), str(version))
