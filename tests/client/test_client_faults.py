@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract.triton import LOST_REGION
+from rfm_client.transport import shared_memory
 from rfm_client.transport.shared_memory import MIN_SHARED_BYTES, SharedMemory
 from servers import PATIENCE_S, Endpoints, Served, start_triton
 from trajectories import random_trajectory
@@ -224,6 +226,60 @@ def test_a_late_word_of_a_restart_keeps_the_memory_mapped_since() -> None:
         assert not server.mapped
 
     asyncio.run(ask())
+
+
+@pytest.mark.usefixtures("nothing_shared_is_left")
+def test_a_restarted_server_gets_the_inputs_in_the_same_call(demo_server: Endpoints) -> None:
+    sample = ProgressSample(heavy(), frame_steps=2)
+    with RewardClient(demo_server.grpc_url, shared_memory=True, retry=False) as client:
+        before, expected = regions(demo_server), client.evaluate([sample])
+        (mapped,) = regions(demo_server) - before
+        with tritonclient.grpc.InferenceServerClient(demo_server.grpc_url.removeprefix("grpc://")) as triton:
+            triton.unregister_system_shared_memory(mapped)  # as a restart does
+        for _ in range(2):
+            assert_same(client.evaluate([sample])[0], expected[0])
+        assert mapped not in regions(demo_server)
+        assert len(regions(demo_server) - before) == 1
+
+
+def test_behind_a_load_balancer_no_region_is_shared_after_the_first(caplog: pytest.LogCaptureFixture) -> None:
+    mapping, memory = RestartedServer(), SharedMemory("grpc://127.0.0.1:1")
+
+    async def ask() -> None:
+        with pytest.raises(InferenceServerException):
+            async with memory.lend(mapping, np.zeros(MIN_SHARED_BYTES, np.uint8)):
+                raise InferenceServerException(LOST_REGION)  # from another server
+        async with memory.lend(mapping, np.zeros(MIN_SHARED_BYTES, np.uint8)) as region:
+            assert region is None
+        await memory.close(mapping)
+
+    asyncio.run(ask())
+    assert not mapping.mapped
+    assert [record.message for record in caplog.records] == [
+        "grpc://127.0.0.1:1: no shared memory, inputs go through the socket: several servers share this address: one "
+        "has mapped a region, another was asked"
+    ]
+
+
+@pytest.mark.usefixtures("nothing_shared_is_left")
+def test_a_server_with_another_dev_shm_gets_the_inputs_through_the_socket(
+    served: Served, protocol: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As in a container whose port is mapped to this host."""
+    samples = [ProgressSample(heavy(), frame_steps=2)] * 2
+    with RewardClient(served.url(protocol)) as client:
+        expected = client.evaluate(samples)
+    with (
+        TemporaryDirectory(dir=shared_memory.FOLDER) as folder,
+        RewardClient(served.url(protocol), shared_memory=True, retry=False) as client,
+    ):
+        monkeypatch.setattr(shared_memory, "FOLDER", Path(folder))
+        for _ in range(2):
+            for answer, plain in zip(client.evaluate(samples), expected, strict=True):
+                assert_same(answer, plain)
+        assert not [*Path(folder).iterdir()]
+    (told,) = (record.message for record in caplog.records if record.name == "rfm_client")
+    assert "no shared memory, inputs go through the socket: Unable to open shared memory region" in told
 
 
 def test_a_server_that_refuses_shared_memory_is_warned_of_once(

@@ -128,7 +128,10 @@ FAILURES = {
         *(1, "--grpc-certificate: expected client certificates (--grpc-client-ca) at 10.0.0.5, "),
         "since TLS alone asks for nothing, got none; --grpc-any-client serves everyone",
     ),
-    "rfm serve repository --gateway-port FREE_PORT --gateway-dataset nope": (1, f"--gateway-dataset: nope: {DATASET} none"),
+    "rfm serve repository --gateway-port FREE_PORT --gateway-dataset nope": (
+        1,
+        f"--gateway-dataset: nope: {DATASET} none",
+    ),
     "rfm serve repository --config mistake.yaml": (
         *(1, "mistake.yaml: expected a YAML file, got a mistake in line 2 "),
         "(expected the node content, but found '<stream end>')",

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import resource
 import subprocess
 import urllib.error
 import urllib.request
@@ -27,15 +26,12 @@ from gateway_requests import (
     ask_json,
     begun,
     dumped,
-    embedded,
     failure,
-    multipart,
     post_body,
     progress,
 )
-from gateways import Address, StandIn, inside, listening, running
-from rfm_gateway.body import IN_MEMORY_BYTES
-from servers import Endpoints, wait_for
+from gateways import Address, StandIn, inside, listening
+from servers import wait_for
 
 KEY = "open sesame"
 SCORED = {"outputs_progress": {"progress_pred": [[pytest.approx(0.1)] * 3]}}  # of FIRST, by the stand-in
@@ -56,24 +52,6 @@ def strict(triton: StandIn) -> Iterator[Address]:
 @pytest.fixture(autouse=True)
 def _open(triton: StandIn) -> None:
     triton.is_open.set()
-
-
-def test_a_body_that_finds_no_room_in_the_temporary_folder_is_a_503(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The kernel refuses files above 1 MiB to the gateway's process, as a full disk does."""
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    with running(Endpoints.free(), tmp_path) as gateway:
-        resource.prlimit(gateway.process.pid, resource.RLIMIT_FSIZE, (2**20, 2**20))
-        large = embedded(0, IN_MEMORY_BYTES // 2**10, (2**9, 2))  # two times what stays in memory
-        with requests.Session() as caller:
-            files, form = multipart([progress(large)])
-            response = caller.post(f"{gateway.url}/evaluate_batch_npy", files=files, data=form)
-            told = f"body: expected room in {tmp_path} of the gateway, got File too large: try again, or "
-            assert failure(response, 503).startswith(told)
-            assert (response.headers["Connection"], response.headers["Retry-After"]) == ("close", "1")
-            assert caller.get(f"{gateway.url}/metrics").ok
-        assert gateway.log.count("503 POST /evaluate_batch_npy") == 1
 
 
 HALVES = {

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+import resource
 import shlex
 from pathlib import Path
 from typing import get_args
@@ -135,3 +136,16 @@ def test_a_video_that_needs_too_much_memory_is_refused(triton: Triton, videos: P
         curve_of(events(post(gateway.url, SCORE, video, fps="1", sampling="all", **QUESTION)))
         assert gateway.metric("samples_total", sample_type="progress") == 3
         assert gateway.metric("requests_total", endpoint=f"/{SCORE}", code="413") == 1
+
+
+@pytest.mark.slow
+def test_a_video_that_finds_no_room_in_the_temporary_folder_is_a_503(triton: Triton, tmp_path: Path) -> None:
+    """The kernel refuses files above 1 MiB to the gateway's process, as a full disk does."""
+    with running(triton.endpoints, tmp_path, ENCODERS, TMPDIR=str(tmp_path)) as gateway:
+        resource.prlimit(gateway.process.pid, resource.RLIMIT_FSIZE, (2**20, 2**20))
+        response = post(gateway.url, SCORE, {"video": b"\0\0\0\x18ftyp" + bytes(2**21)}, **QUESTION)
+        told = f"body: expected room in {tmp_path} of the gateway, got File too large: try again, or "
+        assert failure(response, 503).startswith(told)
+        assert (response.headers["Connection"], response.headers["Retry-After"]) == ("close", "1")
+        assert requests.get(f"{gateway.url}/metrics").ok
+        assert gateway.log.count(f"503 POST /{SCORE}") == 1

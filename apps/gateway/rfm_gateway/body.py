@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+import gc
+import io
 import re
 import reprlib
-from collections import Counter
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator, Mapping, Sequence
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import AsyncGenerator, Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from tokenize import TokenError
@@ -20,22 +21,20 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
 from pydantic_core import from_json
 from python_multipart.multipart import parse_options_header
-from starlette.datastructures import UploadFile
-from starlette.formparsers import MultiPartException, MultiPartParser
 
+from rfm_client import UInt8Array
 from rfm_client.serving import off_loop
 from rfm_gateway import schema
 from rfm_gateway.field_errors import STEPS_FIELD, Path, field_errors, invalid
+from rfm_gateway.form import AS_FILES, MAX_JSON_BYTES, Form, Upload
 
 DECODED_PER_BODY = 2  # limit for decoded files, as a multiple of the body's limit
-MAX_PARTS = 2000  # per multipart request: even an empty part takes memory
-IN_MEMORY_BYTES = 32 * 2**20  # per file; larger files lie on disk
 MAX_SAMPLES = 10_000  # per request
-MAX_JSON_BYTES = 32 * 2**20  # large arrays come as files
-AS_FILES = "send arrays as .npy files, to /evaluate_batch_npy"
 LARGER = "send less in one request, or start the gateway with --max-body-mib (rfm serve: --gateway-max-body-mib)"
 
 _format: Any = np.lib.format  # numpy declares no types for it
+_NPY_HEADERS = {(1, 0): _format.read_array_header_1_0, (2, 0): _format.read_array_header_2_0}
+_NPY_HEAD_BYTES = 2**14  # numpy reads no longer header
 _BROKEN_NPY = (ValueError, TypeError, LookupError, SyntaxError, TokenError, MemoryError, RecursionError)  # numpy errors
 _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
 _SAMPLE_FIELD = re.compile(r"sample_(0|[1-9][0-9]{0,5})")
@@ -99,12 +98,10 @@ class BodyLimits:
         finally:
             left_bytes = float("-inf")
 
-    @asynccontextmanager
-    async def form(self, request: Request) -> AsyncIterator[tuple[dict[str, str], dict[str, UploadFile]]]:
-        """Yield a multipart request's fields and files by name. The files exist until the context ends.
+    async def form(self, request: Request) -> tuple[dict[str, str], dict[str, Upload]]:
+        """Return a multipart request's fields and files by name.
 
-        Raises RequestValidationError for two parts with the same name, HTTPException 415 for another content type and
-        400 for a malformed or incomplete body, which may lack a sample.
+        Raises what ``Form`` raises, but HTTPException 400 for a malformed body, and 415 for another content type.
         """
         kind, options = parse_options_header(request.headers.get("content-type", ""))
         if kind != b"multipart/form-data" or not options.get(b"boundary"):
@@ -113,23 +110,16 @@ class BodyLimits:
         charset = options.get(b"charset", b"utf-8").decode("latin-1")
         if charset.lower() not in _CHARSETS:  # some of Python's codecs fail, others change the text
             raise HTTPException(415, f"content-type: expected the charset utf-8, got {reprlib.repr(charset)}")
-        most: Any = {"max_files": MAX_PARTS, "max_fields": MAX_PARTS, "max_part_size": MAX_JSON_BYTES}
-        parser = _Form(request.headers, self._chunks(request, self.max_bytes, LARGER), **most)
+        announced = request.headers.get("content-length", "")
+        form = Form(int(announced) if announced.isdecimal() else 0)
         try:
+            parser = form.parser(options[b"boundary"])
             with anyio.fail_after(self.timeout_s):
-                form = await parser.parse()
-        except (MultiPartException, ValueError) as error:  # python_multipart raises ValueError
+                async for chunk in self._chunks(request, self.max_bytes, LARGER):
+                    parser.write(chunk)
+        except ValueError as error:
             raise HTTPException(400, f"body: expected multipart/form-data, got: {error}") from None
-        try:
-            if not parser.has_ended:
-                raise HTTPException(400, "body: expected its last boundary at its end, got none")
-            for name, count in Counter(name for name, _ in form.multi_items()).items():
-                if count > 1:
-                    raise invalid((name,), "expected one part of this name, got several")
-            uploads = {name: value for name, value in form.items() if isinstance(value, UploadFile)}
-            yield {name: value for name, value in form.items() if isinstance(value, str)}, uploads
-        finally:
-            await form.close()
+        return form.parts()
 
     async def _chunks(self, request: Request, max_bytes: int, remedy: str) -> AsyncGenerator[bytes, None]:
         coding = request.headers.get("content-encoding", "identity")
@@ -147,24 +137,6 @@ class BodyLimits:
             yield chunk
 
 
-class _Form(MultiPartParser):
-    """Starlette's parser, with a part limit and a flag for the last boundary."""
-
-    spool_max_size = IN_MEMORY_BYTES
-    has_ended = False
-    num_parts = 0
-
-    def on_part_begin(self) -> None:
-        self.num_parts += 1
-        if self.num_parts > MAX_PARTS:
-            expected = f"body: expected at most {MAX_PARTS} parts, fields and files together"
-            raise HTTPException(413, f"{expected}, got more; send the samples in several requests")
-        super().on_part_begin()
-
-    def on_end(self) -> None:
-        self.has_ended = True
-
-
 async def read_json(limits: BodyLimits, request: Request) -> Batch:
     """Return the samples in a JSON request. Raises RequestValidationError and the errors from ``limits``."""
     body = await limits.read_json(request)
@@ -172,19 +144,13 @@ async def read_json(limits: BodyLimits, request: Request) -> Batch:
 
 
 async def read_multipart(limits: BodyLimits, request: Request) -> Batch:
-    """Return the samples in a multipart request. Large files lie on disk until they are decoded.
-
-    Raises RequestValidationError and the errors from ``limits``.
-    """
-    async with limits.form(request) as (fields, uploads):
-        for name in uploads:
-            if name == STEPS_FIELD or _ANY_SAMPLE_FIELD.fullmatch(name):
-                raise invalid((name,), "expected a form field, got a file")
-        json_bytes = sum(map(len, fields.values()))
-        if json_bytes > MAX_JSON_BYTES:
-            raise HTTPException(413, f"body: expected at most {MAX_JSON_BYTES} bytes of JSON, got more; {AS_FILES}")
-        num_bytes = json_bytes + sum(upload.size or 0 for upload in uploads.values())
-        return await off_loop(num_bytes, _of_form, fields, uploads, num_bytes)
+    """Return the samples in a multipart request. Raises RequestValidationError and the errors from ``limits``."""
+    fields, uploads = await limits.form(request)
+    for name in uploads:
+        if name == STEPS_FIELD or _ANY_SAMPLE_FIELD.fullmatch(name):
+            raise invalid((name,), "expected a form field, got a file")
+    num_bytes = sum(map(len, fields.values())) + sum(upload.content.nbytes for upload in uploads.values())
+    return await off_loop(num_bytes, _of_form, fields, uploads, num_bytes)
 
 
 def _of_json(body: bytes) -> Batch:
@@ -192,26 +158,34 @@ def _of_json(body: bytes) -> Batch:
     return Batch(_checked(samples, {}), [*samples], use_frame_steps, len(body))
 
 
-def _of_form(fields: Mapping[str, str], uploads: Mapping[str, UploadFile], num_bytes: int) -> Batch:
+def _of_form(fields: Mapping[str, str], uploads: Mapping[str, Upload], num_bytes: int) -> Batch:
     samples: dict[Path, Any] = {(name,): _parsed(fields[name], (name,)) for name in _sample_fields(fields)}
-    arrays = {name: cache(partial(_read_npy, upload)) for name, upload in uploads.items()}  # each file is decoded once
+    arrays = {
+        name: cache(partial(_read_npy, upload.content)) for name, upload in uploads.items()
+    }  # each file is decoded once
     steps = _flag(fields.get(STEPS_FIELD), _FORM_FLAGS)
     return Batch(_checked(samples, arrays), [*samples], steps, num_bytes)
 
 
-def _read_npy(upload: UploadFile) -> np.ndarray[Any, Any]:
-    """Return the numbers in a .npy file. Raises ValueError, also for pickle and for bytes behind the array."""
-    upload.file.seek(0)
+def _read_npy(content: UInt8Array) -> np.ndarray[Any, Any]:
+    """Return the numbers in a .npy file, as a view if they are aligned.
+
+    Raises ValueError, also for pickle and for bytes behind the array.
+    """
+    head = io.BytesIO(content[:_NPY_HEAD_BYTES].tobytes())
     try:
-        array: np.ndarray[Any, Any] = _format.read_array(upload.file, allow_pickle=False)
+        shape, is_by_column, dtype = _NPY_HEADERS[_format.read_magic(head)](head)
+        if dtype.kind not in "biuf":
+            raise ValueError(f"{dtype} instead of numbers")
+        if min(shape, default=0) < 0:  # numpy would take as many numbers as there are
+            raise ValueError(f"the shape {shape}")
+        order: Any = "F" if is_by_column else "C"
+        array: np.ndarray[Any, Any] = np.ndarray(shape, dtype, content, head.tell(), order=order)
     except _BROKEN_NPY as error:
         raise ValueError(f"expected a .npy file, got: {error}") from None
-    if array.dtype.kind not in "biuf":
-        raise ValueError(f"expected a .npy file of numbers, got {array.dtype}")
-    if upload.file.read(1):
+    if head.tell() + array.nbytes < len(content):
         raise ValueError(f"expected a .npy file of {array.nbytes} bytes behind its header, got more")
-    upload.file.close()  # frees its memory
-    return array
+    return np.require(array, requirements="A")
 
 
 def _flag(value: Any, flags: Mapping[str, bool] = _FLAGS) -> bool | None:
@@ -224,10 +198,13 @@ def _flag(value: Any, flags: Mapping[str, bool] = _FLAGS) -> bool | None:
 
 
 def _parsed(text: bytes | str, loc: tuple[str, ...]) -> Any:
+    gc.disable()  # it would go through all lists again and again while they are made
     try:
         return from_json(text)
     except (ValueError, TypeError) as error:  # TypeError: text that is not UTF-8
         raise invalid(loc, f"expected JSON, got: {error}", "json_invalid") from None
+    finally:
+        gc.enable()
 
 
 def _unwrapped(document: Any) -> tuple[dict[Path, Any], bool | None]:

@@ -113,8 +113,10 @@ class GatewayConfig(Settings):
     def client(self, checkpoint: str | None = None) -> AsyncRewardClient:
         """Return a client for Triton. Raises ValueError for a malformed URL or unusable files.
 
-        checkpoint: name of another export; None: the gateway's
+        checkpoint: name of another export, which gets no shared memory: it would not pay for a few calls; None: the
+            gateway's
         """
+        host = self.triton_url.partition("://")[2].rpartition(":")[0].strip("[]")
         try:
             return AsyncRewardClient(
                 self.triton_url,
@@ -122,6 +124,7 @@ class GatewayConfig(Settings):
                 timeout_s=self.timeout_s,
                 retry=False,  # the caller gets the error at once, and may retry
                 max_in_flight=self.max_in_flight,
+                shared_memory=checkpoint is None and ListenAddress(host, 0).is_loopback,
                 **self.credentials.options,
             )
         except InvalidValueError as error:

@@ -21,9 +21,10 @@ from rfm_client.options import ConfigError
 from rfm_gateway.body import BodyLimits
 from rfm_gateway.config import GatewayConfig
 from rfm_gateway.field_errors import field_errors, invalid
+from rfm_gateway.form import Upload
 from rfm_gateway.observe import GatewayMetrics, while_connected
 
-__all__ = ["BodyLimits", "GatewayConfig", "PageHost", "field_errors", "invalid", "while_connected"]
+__all__ = ["BodyLimits", "GatewayConfig", "PageHost", "Upload", "field_errors", "invalid", "while_connected"]
 
 INSTALL = "pip install ./client ./apps/gateway ./apps/page"
 _PACKAGE = Path(__file__).parent

@@ -8,7 +8,6 @@ the files and addresses that a playlist or a session description names.
 from __future__ import annotations
 
 import asyncio
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,12 +18,11 @@ import numpy as np
 import numpy.typing as npt
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, Field, StringConstraints, ValidationError
-from starlette.datastructures import UploadFile
 
 from rfm_client import InvalidSampleError, ModelInfo, Trajectory
 from rfm_client.frames import ChannelOrder, Correction, Orientation, Rule, Sampling, frame_times_s, read_video
 from rfm_client.options import InvalidValueError
-from rfm_gateway.mounting import field_errors, invalid
+from rfm_gateway.mounting import Upload, field_errors, invalid
 
 DEFAULT_FPS = 3.0  # the default in rfm-client score
 MOST_FRAMES = 4096  # in a prefix: more than any checkpoint takes
@@ -84,7 +82,7 @@ class VideoRequest(BaseModel):
         except InvalidValueError as error:
             raise invalid((error.where,), error.problem) from None
 
-    async def video(self, uploads: Mapping[str, UploadFile], name: str, take: Callable[[int], object]) -> ShownVideo:
+    async def video(self, uploads: Mapping[str, Upload], name: str, take: Callable[[int], object]) -> ShownVideo:
         """Read the uploaded video with this name. Raises RequestValidationError, and what ``take`` raises.
 
         take: called with the frames' size in bytes before they are decoded
@@ -96,17 +94,14 @@ class VideoRequest(BaseModel):
         except InvalidSampleError as error:
             raise invalid((name if error.where == "video" else error.where,), error.problem) from None
 
-    def _read(self, upload: UploadFile, take: Callable[[int], object]) -> ShownVideo:
-        name = upload.filename or "the video"
-        upload.file.seek(0)
-        container = _container(upload.file.read(_BEGINNING_BYTES))
+    def _read(self, upload: Upload, take: Callable[[int], object]) -> ShownVideo:
+        name = upload.name or "the video"
+        container = _container(upload.content[:_BEGINNING_BYTES].tobytes())
         if container is None:
             raise InvalidSampleError.at("video", f"a file of the kind {KINDS}", f"another kind ({name})")
         with TemporaryDirectory(prefix="rfm-gateway-") as folder:
             file = Path(folder) / "video"
-            upload.file.seek(0)
-            with file.open("wb") as copy:
-                shutil.copyfileobj(upload.file, copy)
+            file.write_bytes(upload.content.data)
             try:
                 frames = read_video(file, self.fps, take=take, container=container)
                 times_s = frame_times_s(file, len(frames), container=container)

@@ -22,7 +22,6 @@ import anyio
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from pydantic_core import to_json
-from starlette.datastructures import UploadFile
 
 from rfm_client import (
     FRAME_SCORES,
@@ -40,7 +39,7 @@ from rfm_client import (
 )
 from rfm_client.frames import BlankFrames, ChannelOrder, Orientation, Rule, Sampling, resize_frames
 from rfm_client.serving import off_loop
-from rfm_gateway.mounting import GatewayConfig, PageHost, invalid, while_connected
+from rfm_gateway.mounting import GatewayConfig, PageHost, Upload, invalid, while_connected
 from rfm_page.questions import DEFAULT_FPS, ShownVideo, VideoRequest
 
 MIN_COMPARED = 2  # videos
@@ -111,16 +110,16 @@ def viewer_routes(host: PageHost) -> APIRouter:
 
         Raises RequestValidationError, HTTPException and RewardError.
         """
-        async with limits.form(request) as (fields, uploads):
-            question = VideoRequest.of(fields, config.checkpoint)
-            async with config.client(question.model) as client:
-                info = await client.model_info(frames=True)
-            sampling = question.sampling(info)
-            videos = await while_connected(request, decoded(question, uploads, names or tuple(uploads)))
+        fields, uploads = await limits.form(request)
+        question = VideoRequest.of(fields, config.checkpoint)
+        async with config.client(question.model) as client:
+            info = await client.model_info(frames=True)
+        sampling = question.sampling(info)
+        videos = await while_connected(request, decoded(question, uploads, names or tuple(uploads)))
         return _Asked(question, sampling, info, videos, request.state.request_id)
 
     async def decoded(
-        question: VideoRequest, uploads: Mapping[str, UploadFile], names: tuple[str, ...]
+        question: VideoRequest, uploads: Mapping[str, Upload], names: tuple[str, ...]
     ) -> tuple[ShownVideo, ...]:
         with limits.decoding() as take, anyio.move_on_after(config.timeout_s):
             return tuple([await question.video(uploads, name, take) for name in names])

@@ -95,12 +95,20 @@ class TritonTransport:
         waits_us = max(int(timeout_s * _US_PER_S), 1)
         largest = max(inputs, key=lambda name: inputs[name].nbytes)
 
-        async def request(client: Any) -> Answer:
-            lent = nullcontext() if self._shared_memory is None else self._shared_memory.lend(client, inputs[largest])
-            async with lent as region:
+        async def ask(client: Any, memory: SharedMemory | None) -> tuple[Tensors, str]:
+            async with nullcontext() if memory is None else memory.lend(client, inputs[largest]) as region:
                 regions = {largest: region} if region is not None else {}
                 check_size(inputs, regions)
-                arrays, version = await client.score(model, inputs, regions, outputs, request_id, waits_us)
+                answer: tuple[Tensors, str] = await client.score(model, inputs, regions, outputs, request_id, waits_us)
+                return answer
+
+        async def request(client: Any) -> Answer:
+            try:
+                arrays, version = await ask(client, self._shared_memory)
+            except InferenceServerException as error:
+                if triton.LOST_REGION not in (error.message() or ""):
+                    raise
+                arrays, version = await ask(client, None)
             absent = [name for name in outputs if name not in arrays]
             if absent:
                 raise errors.InferenceFailedError(f"outputs: expected {', '.join(outputs)}, got no {', '.join(absent)}")

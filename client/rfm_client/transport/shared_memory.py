@@ -4,6 +4,9 @@
 Requests take turns using a pool of regions. A region is registered with the server, and its name leaves /dev/shm once
 the server has mapped it. So if this process crashes, no data stays there, only the server's mapping until a restart.
 
+Names are random. So a server that has another /dev/shm, though its address is of this host (a container, a tunnel),
+cannot map a region and refuses it, and inputs go through the socket.
+
 Not ``tritonclient.utils.shared_memory``: its regions keep their names, and they are sparse, so that a full /dev/shm
 kills the writing process (SIGBUS).
 """
@@ -11,6 +14,7 @@ kills the writing process (SIGBUS).
 from __future__ import annotations
 
 import asyncio
+import errno
 import itertools
 import logging
 import mmap
@@ -26,6 +30,7 @@ import numpy.typing as npt
 from tritonclient.utils import InferenceServerException
 
 from rfm_client.contract import triton
+from rfm_client.contract.errors import InferenceFailedError
 from rfm_client.transport.limits import timeout
 from rfm_client.transport.threads import off_loop
 
@@ -39,10 +44,17 @@ logger = logging.getLogger("rfm_client")
 
 
 class Region:
-    """Memory that the server also maps. generation: how many server restarts were noticed before."""
+    """Memory that the server also maps. Raises OSError unless half of /dev/shm stays free, which the server needs.
+
+    generation: how many server restarts were noticed before
+    """
 
     def __init__(self, name: str, byte_size: int, generation: int) -> None:
         self.name, self.byte_size, self.generation = name, byte_size, generation
+        self.was_read = False  # by the server
+        room = os.statvfs(FOLDER)
+        if room.f_bavail * room.f_frsize - byte_size < room.f_blocks * room.f_frsize / 2:
+            raise OSError(errno.ENOSPC, f"less than half of {FOLDER} would stay free")
         descriptor = os.open(FOLDER / name, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_CLOEXEC, 0o600)
         try:
             os.posix_fallocate(descriptor, 0, byte_size)  # raises OSError now, where a write would raise SIGBUS later
@@ -78,9 +90,8 @@ class SharedMemory:
 
     @asynccontextmanager
     async def lend(self, client: Any, array: npt.NDArray[Any]) -> AsyncIterator[Region | None]:
-        """Lend a region with a copy of ``array``; None: the array is small, or the server cannot share memory."""
-        is_large = array.nbytes >= MIN_SHARED_BYTES
-        region = await self._take(client, array.nbytes) if self._is_usable and is_large else None
+        """Lend a region with a copy of ``array``; None: the array is small, or there is no region for it."""
+        region = await self._take(client, array.nbytes) if array.nbytes >= MIN_SHARED_BYTES else None
         if region is None:
             yield None
             return
@@ -88,10 +99,13 @@ class SharedMemory:
         try:
             await asyncio.shield(writing)
             yield region
+            region.was_read = True
         except InferenceServerException as error:
             if triton.LOST_REGION in (error.message() or "") and region.generation == self._generation:
                 self._generation += 1  # the server was restarted, and knows no region
                 self._free.clear()
+                if not region.was_read:
+                    self._give_up("several servers share this address: one has mapped a region, another was asked")
             raise
         finally:
             # After a cancelled call the server may still read the region, but its answer is dropped.
@@ -116,6 +130,8 @@ class SharedMemory:
             region = min(fitting, key=lambda region: region.byte_size)
             self._free.remove(region)
             return region
+        if not self._is_usable:
+            return None
         if self._free:  # all too small: replace a region, so that regions never outnumber concurrent requests
             await self._unregister(client, self._free.pop().name)
         try:
@@ -134,11 +150,15 @@ class SharedMemory:
             self._registered.discard(region.name)
             self._give_up(reason)
             return None
+        except InferenceFailedError as error:  # from a proxy
+            self._give_up(str(error))
+            return None
         finally:
             region.unlink()
         return region
 
     def _give_up(self, reason: str) -> None:
+        """Make no more regions."""
         if self._is_usable:
             self._is_usable = False
             logger.warning("%s: no shared memory, inputs go through the socket: %s", self._url, reason)
