@@ -33,6 +33,8 @@ from rfm_export.pbtxt import Interface, Warmup, ensemble_config, python_config, 
 
 WARMUP_FOLDER = "warmup"
 KEEP_FILE = ".keep"  # Triton needs an ensemble's version folder, but git drops empty folders
+# An empty file, so that Python cannot store bytecode: Triton loads a version again when its folder has changed.
+NO_BYTECODE = "__pycache__"
 
 WARMUP_TASK = "warm up"
 
@@ -62,8 +64,9 @@ class GeneratedModel:
 
     def files(self) -> dict[str, bytes]:
         """Return file contents by path in the repository."""
-        in_version = (KEEP_FILE, b"") if self.model_file is None else (MODEL_FILE, self.model_file)
-        contents = {CONFIG_FILE: render(self.config).encode(), f"{self.version}/{in_version[0]}": in_version[1]}
+        in_version = {KEEP_FILE: b""} if self.model_file is None else {MODEL_FILE: self.model_file, NO_BYTECODE: b""}
+        contents = {CONFIG_FILE: render(self.config).encode()}
+        contents |= {f"{self.version}/{name}": content for name, content in in_version.items()}
         contents |= {f"{WARMUP_FOLDER}/{name}": content for name, content in self.warmup_files.items()}
         return {f"{self.name}/{path}": content for path, content in contents.items()}
 

@@ -33,6 +33,7 @@ from rfm_export.layout import WARMUP_FOLDER, GeneratedModel, generated_files
 from rfm_export.pbtxt import parse, render, serving_versions
 
 _SCRATCH = ".export-"
+_STEP_NS = 10**6  # file systems round times
 
 _log = logging.getLogger(__name__)
 
@@ -122,9 +123,14 @@ def replace_config(repository: Path, config: pb.ModelConfig, scratch: Path) -> N
     """Replace a configuration atomically: readers never see a part.
 
     scratch: a folder on the same file system
+
+    It becomes the model's newest file, also after the clock was set back: else Triton ignores the next load request.
     """
-    (scratch / CONFIG_FILE).write_text(render(config))
-    (scratch / CONFIG_FILE).replace(repository / config.name / CONFIG_FILE)
+    new, model = scratch / CONFIG_FILE, repository / config.name
+    new.write_text(render(config))
+    newest_ns = max(path.lstat().st_mtime_ns for path in (new, model, *model.rglob("*")))
+    os.utime(new, ns=(newest_ns, newest_ns + _STEP_NS))
+    new.replace(model / CONFIG_FILE)
 
 
 def publish(repository: Path, staged: Path, models: Sequence[GeneratedModel]) -> None:

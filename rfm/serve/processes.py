@@ -22,8 +22,7 @@ import psutil
 
 from rfm.serve.installation import ServerStartError
 
-EXIT_TIMEOUT_S = 10  # for requests in flight; Triton also waits this long for a dead model process
-KILL_AFTER_S = 2 * EXIT_TIMEOUT_S
+KILL_AFTER_S = 20.0  # for requests in flight
 REAP_S, POLL_S = 5.0, 0.02  # a driver or a disk may hold a killed process for longer
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SIGNALS = {each.value: each.name for each in signal.Signals}
@@ -69,13 +68,13 @@ class ProcessGroup:
         if self._sentinel.returncode is None:  # else another group may have the id
             os.killpg(self.id, signal.SIGKILL)
 
-    def end(self) -> None:
-        """End the process gracefully, by force after KILL_AFTER_S, then the rest of the group."""
+    def end(self, within_s: float = KILL_AFTER_S) -> None:
+        """End the process gracefully, by force after ``within_s``, then the rest of the group."""
         if self._sentinel.returncode is not None:  # all have ended
             return
         self.process.terminate()
         with suppress(subprocess.TimeoutExpired):
-            self.process.wait(KILL_AFTER_S)
+            self.process.wait(within_s)
         self.kill()
         self.process.wait()
         ends_s = time.monotonic() + REAP_S

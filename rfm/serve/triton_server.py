@@ -21,7 +21,6 @@ from rfm.serve.access import Endpoints, check_version, http_headers, new_key, re
 from rfm.serve.installation import WHEEL_VERSION, Installation, ServerStartError, find_installation
 from rfm.serve.probe import NO_ANSWER, Http
 from rfm.serve.processes import (
-    EXIT_TIMEOUT_S,
     NEEDS_ROOM,
     SHARED_MEMORY,
     UNKNOWN,
@@ -87,8 +86,9 @@ def _knows(program: Path, option: str) -> bool:
 
 POLL_S = 0.1
 LOAD_S = 1800.0
+STOP_S = 10.0  # for requests in flight; Triton also waits for open HTTP connections and dead model processes
+_NEVER_S = 3600  # Triton's own limit for a stop; when it expires, Triton crashes under its requests
 ANSWER_TIMEOUT_S = 10.0  # while the server starts
-NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # else a version's folder changes, and a `load` reloads all versions
 SECRET = re.compile("RFM_.*_KEY")  # variables withheld from Triton and the model processes
 _REMEDIES = {  # by pattern in the reason why a model is not loaded
     "unsupported gpu id|KIND_GPU|compiled with CUDA|no NVIDIA driver": (
@@ -203,9 +203,9 @@ class TritonServer:
             raise ServerStartError.at(error.filename, "to be readable", error.strerror) from error
 
     def stop(self) -> None:
-        """End the server gracefully, by force after KILL_AFTER_S."""
+        """End the server gracefully, by force after STOP_S."""
         if self._group is not None:
-            self._group.end()
+            self._group.end(STOP_S)
         if self._claim is not None:
             self._claim.release()
             self._claim = None
@@ -305,7 +305,7 @@ class TritonServer:
             "--disable-auto-complete-config",
             "--strict-readiness=false",  # else a failed version makes the whole server not ready
             "--exit-on-error=false",  # keeps the reason for each failed model readable
-            f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
+            f"--exit-timeout-secs={_NEVER_S}",
             *self.endpoints.arguments(),
             *([f"--http-thread-count={self.http_threads}"] if self.http_threads else []),
             *restrictions(self.admin_key),
@@ -314,7 +314,7 @@ class TritonServer:
     def _environment(self) -> dict[str, str]:
         own = {name: value for name, value in os.environ.items() if not SECRET.fullmatch(name)}
         of_models = {HANG_VARIABLE: str(self.hang_s)}
-        return {**short_spin(own), **own, **self.installation.environment, **NO_BYTECODE, **of_models}
+        return {**short_spin(own), **own, **self.installation.environment, **of_models}
 
 
 def _failed(problem: str, model: str) -> ServerStartError:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import logging
 import os
@@ -93,6 +94,7 @@ class BatchModel(Generic[Question, Answer]):
             self._pipeline.close()
         self._metrics.close()
         self._watchdog.close()
+        gc.collect()  # of requests and their errors: a request that outlives Triton's memory crashes the process
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
         """Load the weights in the folder ``version`` onto ``device``."""

@@ -119,5 +119,5 @@ def test_training_is_reproducible_and_its_result_is_served_as_any_checkpoint(tmp
 
 
 def test_the_committed_repository_is_small() -> None:
-    files = [file for file in REPOSITORY.rglob("*") if file.is_file() and "__pycache__" not in file.parts]
+    files = [file for file in REPOSITORY.rglob("*") if file.is_file()]
     assert sum(file.stat().st_size for file in files) <= 3e6

@@ -4,14 +4,21 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from pathlib import Path
 
 import psutil
+import pytest
 
 from commands import is_alive
-from servers import PATIENCE_S, wait_for
+from repositories import make_repository
+from rfm_client import ProgressSample, RewardClient, RewardError
+from servers import PATIENCE_S, start_triton, wait_for
+from trajectories import random_trajectory
 
 GROUP = """
 import ctypes, os, sys, time
@@ -53,3 +60,21 @@ group.end()
 sys.exit(len(list(children_of(os.getpid()))))
 """
     assert subprocess.run([sys.executable, "-c", GROUP + code], check=False, timeout=PATIENCE_S).returncode == 0
+
+
+@pytest.mark.triton
+@pytest.mark.slow
+def test_triton_does_not_crash_when_it_is_stopped_under_http_requests(tmp_path: Path) -> None:
+    """Triton 2.51 waits for open connections; when its own limit expires, it exits while requests run."""
+    sample = ProgressSample(random_trajectory(0, 3, 64, 32))
+    with (
+        start_triton(make_repository(tmp_path)) as server,
+        RewardClient(server.endpoints.http_url) as client,
+        ThreadPoolExecutor(1) as thread,
+    ):
+        client.evaluate([sample])
+        stopped = thread.submit(server.stop)
+        while not stopped.done():
+            with suppress(RewardError):
+                client.evaluate([sample], timeout_s=1)
+    assert server.exit_status in (0, -signal.SIGKILL)

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import signal
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -139,6 +140,8 @@ def test_a_broken_version_is_never_asked_and_a_good_one_is_rolled_out(running: R
     """No call is lost, and the other models stay."""
     name, sample = "fragile", ProgressSample(random_trajectory(1, 5))
     running.export_plain(name)
+    tomorrow_s = time.time() + 86400
+    os.utime(running.repository / name / "config.pbtxt", (tomorrow_s, tomorrow_s))  # the clock was set back since
     assert re.fullmatch(f"{name}: loading\n{name}: 1 ready after \\d+ s\n", running.models("load", name))
     running.export_plain(name, rollout.other_checkpoint(tmp_path / "other", PLAIN.checkpoint))
     expected = load_engine(PLAIN.name).evaluate([sample])

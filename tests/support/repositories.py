@@ -95,7 +95,7 @@ FAILING = answering(f"""if any(getattr(question.sample, "frame_steps", 0) == {FA
 def make_repository(folder: Path, more_code: str = "") -> Path:
     """The demo's ``rfm`` on one thread, with more code in its model.py."""
     repository = folder / "model_repository"
-    shutil.copytree(REPOSITORY / MODEL, repository / MODEL, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(REPOSITORY / MODEL, repository / MODEL)
     model = repository / MODEL / "1" / "model.py"
     model.write_text(model.read_text() + more_code)
     configure(repository / MODEL, torch_threads=1)

@@ -197,13 +197,17 @@ class Recorded(Installation):
 
 @pytest.mark.slow
 def test_the_process_of_an_unloaded_model_does_not_crash(tmp_path: Path) -> None:
-    """The Python backend's metrics do not bear to be destroyed at the end."""
+    """The Python backend's metrics do not bear to be destroyed at the end, nor do its requests."""
+    question = wire.encode_samples([ProgressSample(random_trajectory(0, 3, 64, 32))])
+    question[wire.SAMPLE_TYPE] = np.array([[9]], np.uint8)
     wheel, Recorded.file = find_installation(), tmp_path / "statuses"
     program = Recorded(wheel.executable, wheel.environment, wheel.wheel)
     with (
         start_triton(make_repository(tmp_path), program) as server,
         RepositoryApi(server.endpoints.grpc_url, server.admin_key) as api,
     ):
+        with pytest.raises(InvalidSampleError):
+            infer(server.endpoints.grpc_url, "rfm", question, ["progress"])
         api.unload("rfm")
         wait_for(Recorded.file.exists)
         assert Recorded.file.read_text() == "0\n"

@@ -31,7 +31,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract.wire import Tensors, encode_samples
-from servers import Served
+from servers import Served, model_processes
 from tolerances import TOLERANCE
 from trajectories import random_trajectory
 from vlm import video
@@ -204,6 +204,13 @@ def test_a_pair_of_two_frame_sizes_may_be_sent_through_shared_memory(served: Ser
         with tritonclient.grpc.InferenceServerClient(served.url("grpc").removeprefix("grpc://")) as triton:
             assert triton.get_system_shared_memory_status().regions
     assert_same(result, load_engine(FRAMES_MODEL).evaluate([pair])[0])
+
+
+def test_a_load_of_an_unchanged_model_keeps_its_process(served: Served) -> None:
+    before = model_processes(served.server.pid, MODEL)
+    with served.api() as api:
+        api.load(MODEL)
+    assert model_processes(served.server.pid, MODEL) == before != []
 
 
 @pytest.mark.usefixtures("served")
