@@ -33,7 +33,6 @@ from rfm_client.contract.samples import (
 from rfm_client.contract.wire import DEFAULT_MODEL, PROBE_PREFIX, Part, encoder_name, frames_name
 from rfm_client.episodes.options import StepScore
 from rfm_client.episodes.scorer import Asked, StepScorer
-from rfm_client.episodes.steps import prefix_windows
 from rfm_client.frames.fit_to_checkpoint import resize_frames
 from rfm_client.frames.sampling import Sampling
 from rfm_client.scoring.samples import Call, CallOptions, SampleScorer, results_of
@@ -166,7 +165,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
 
         go_on = go_on or (lambda: None)
         if info.by_digest and not trajectory.has_views:
-            results = await self._steps.in_turn(prefix_windows(trajectory, rule), info, begin, go_on)
+            results = await self._steps.in_turn(trajectory, rule, info, begin, go_on)
             return rule.joined(cast("list[ProgressResult]", results))
         parts, results = rule.parts(trajectory), []
         # in a thread, because copying many frames would block the event loop

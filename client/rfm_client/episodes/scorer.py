@@ -10,9 +10,9 @@ from __future__ import annotations
 import asyncio
 import random
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
-from itertools import groupby, islice, zip_longest
+from itertools import groupby, islice
 from typing import TypeAlias
 from weakref import WeakKeyDictionary
 
@@ -20,16 +20,19 @@ from rfm_client.contract import wire
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, RewardError
 from rfm_client.contract.results import ProgressResult, Result
-from rfm_client.contract.samples import UInt8Array
+from rfm_client.contract.samples import Trajectory, UInt8Array
 from rfm_client.contract.wire import frames_name
 from rfm_client.episodes.options import StepScore
-from rfm_client.episodes.steps import Steps, Window
+from rfm_client.episodes.steps import Frame, Steps, Window
 from rfm_client.frames.blank_frames import FRAMES_IN_A_ROW
+from rfm_client.frames.sampling import Sampling
 from rfm_client.scoring.samples import Call, SampleScorer, for_each, results_of
 from rfm_client.transport.threads import off_loop
 
 MAX_NEW_BYTES = 3 * 2**20  # frame bytes per request: the server prepares a request while the next is sent
-MAX_NEW_BYTES_IN_TURN = 4 * 2**20  # the same for one episode, where a request waits for the answer to the last
+MAX_NEW_BYTES_IN_TURN = 4 * 2**20  # the same for one episode, where a request waits for the answer to the last,
+LEAST_IN_TURN = 4  # unless it has fewer windows
+MOST_REFUSALS = 3  # in an episode; then the server keeps too few frames
 MAX_REMEMBERED = 2**17  # digests of sent frames; the oldest are forgotten
 
 
@@ -37,14 +40,10 @@ Asked: TypeAlias = tuple[Steps, int]  # an episode, and the step to score
 
 
 class _Server:
-    """Frame digests that one server has received.
-
-    number: the server's index
-    num_refusals: how often the server lacked frames that it had received
-    """
+    """Frame digests that one server has received. number: the server's index."""
 
     def __init__(self, number: int) -> None:
-        self.number, self.num_refusals = number, 0
+        self.number = number
         self._sent: OrderedDict[bytes, None] = OrderedDict()
 
     def __contains__(self, digest: bytes) -> bool:
@@ -90,9 +89,14 @@ class StepScorer:
         ]
 
     async def in_turn(
-        self, windows: Sequence[Window], info: ModelInfo, begin: Callable[[], Call], go_on: Callable[[], None]
+        self,
+        trajectory: Trajectory,
+        sampling: Sampling,
+        info: ModelInfo,
+        begin: Callable[[], Call],
+        go_on: Callable[[], None],
     ) -> list[Result]:
-        """Return results for one episode's windows. A request waits for the one before, so each frame travels once.
+        """Return a result for each prefix. A request waits for the one before, so each frame travels once.
 
         If the server keeps too few frames, the later requests send all that they show, once each.
 
@@ -101,25 +105,41 @@ class StepScorer:
 
         Raises RewardError.
         """
-        self._scorer.tell_of_length(max(len(window.frames) for window in windows), info)
+        frames = [Frame(pixels) for pixels in trajectory.positions]
+        self._scorer.tell_of_length(len(sampling.prefix(len(frames) - 1).indices), info)
         call, results = begin(), list[Result]()
         outputs = (*wire.outputs_for((), info.scores, all_scores=call.all_scores), *call.outputs)
-        server = self._server(windows[0])
-        num_refusals = server.num_refusals
-        count = min(max(MAX_NEW_BYTES_IN_TURN // windows[0].frames[0].pixels.nbytes, 1), info.max_batch_size)
-        parts = [windows[start : start + count] for start in range(0, len(windows), count)]
-        hashed = asyncio.create_task(_hashed(parts[0]))
+        count = max(MAX_NEW_BYTES_IN_TURN // frames[0].pixels.nbytes, LEAST_IN_TURN)
+        count = min(count, info.max_batch_size or count)
+
+        def prepared(start: int) -> list[Window]:
+            """Return some windows, with the frames' digests."""
+            of_prefixes = (sampling.prefix(t).indices for t in range(start, min(start + count, len(frames))))
+            windows = [
+                Window(tuple(frames[index] for index in indices), trajectory.task, trajectory)
+                for indices in of_prefixes
+            ]
+            _hash(windows)
+            return windows
+
+        shown: set[bytes] = set()
+        num_refusals = 0
+        following = asyncio.create_task(asyncio.to_thread(prepared, 0))
         try:
-            for part, following in zip_longest(parts, parts[1:], fillvalue=()):
-                await hashed
-                hashed = asyncio.create_task(_hashed(following))  # while the server scores
-                go_on()
-                results += results_of(list(await self._outcomes(part, outputs, begin())), "samples[{}]")
-                if server.num_refusals > num_refusals:
-                    shown = windows[: len(results)]
-                    server.forget(frame.digest for window in shown for frame in window.frames)
+            while windows := await following:
+                following = asyncio.create_task(asyncio.to_thread(prepared, len(results) + len(windows)))
+                go_on()  # the server scores while the next windows are prepared
+                outcomes, was_refused = await self._outcomes(windows, dict.fromkeys(outputs), begin())
+                results += results_of(list(outcomes), "samples[{}]")
+                num_refusals += was_refused
+                server, own = self._server(windows[0]), {frame.digest for each in windows for frame in each.frames}
+                if was_refused:
+                    server.forget(shown - own)
+                if num_refusals > MOST_REFUSALS:
+                    server.forget(own)
+                shown |= own
         finally:
-            hashed.cancel()
+            following.cancel()
         return results
 
     async def _all_outcomes(self, windows: Sequence[Window], info: ModelInfo, call: Call) -> list[Result | RewardError]:
@@ -130,13 +150,14 @@ class StepScorer:
                 self._scorer.tell_of_blank([frame.pixels for frame in frames])
         if not info.by_digest:
             return await self._whole(windows, call)
-        await _hashed(windows)
+        num_new = sum(w.num_bytes // len(w.frames) for w in windows)  # about one frame in each window is new
+        await off_loop(num_new, _hash, windows)
         outcomes: dict[int, Result | RewardError] = {}
         parts = list(self._parts(windows, info.max_batch_size))
         outputs = wire.outputs_for((), info.scores)
         asked = (self._outcomes([windows[index] for index in part], outputs, call) for part in parts)
         answered = await asyncio.gather(*asked)
-        for part, of_part in zip(parts, answered, strict=True):
+        for part, (of_part, _) in zip(parts, answered, strict=True):
             outcomes.update(zip(part, of_part, strict=True))
         return [outcomes[index] for index in range(len(windows))]
 
@@ -166,26 +187,30 @@ class StepScorer:
             yield part
 
     async def _outcomes(
-        self, windows: Sequence[Window], outputs: Sequence[str], call: Call
-    ) -> Sequence[Result | RewardError]:
-        """Send a request. If it fails, perhaps because the server lacks frames, send all frames, then whole samples."""
+        self, windows: Sequence[Window], outputs: Collection[str], call: Call
+    ) -> tuple[Sequence[Result | RewardError], bool]:
+        """Return each window's outcome, and True if the server lacked frames that it had received.
+
+        If a request fails, that server gets all frames, and after another error whole samples.
+        """
         server = self._server(windows[0])
         call = call.at(server.number)
         shown = {frame.digest: frame.pixels for window in windows for frame in window.frames}
+        sent = [pixels for digest, pixels in shown.items() if digest not in server]
+        was_refused = False
         while True:
-            sent = [pixels for digest, pixels in shown.items() if digest not in server]
             try:
                 results = await self._request(windows, sent, outputs, call)
-            except (InvalidSampleError, InferenceFailedError):
+            except (InvalidSampleError, InferenceFailedError) as error:
                 server.forget(shown)
-                if len(sent) < len(shown):
-                    server.num_refusals += 1
-                    continue
-                return await self._whole(windows, call)
+                if len(sent) == len(shown) or wire.UNKNOWN_FRAMES not in str(error):
+                    return await self._whole(windows, call), was_refused
+                sent, was_refused = list(shown.values()), True
             except RewardError as error:
-                return for_each(error, len(windows))
-            server.remember(shown)
-            return results
+                return for_each(error, len(windows)), was_refused
+            else:
+                server.remember(shown)
+                return results, was_refused
 
     def _server(self, window: Window) -> _Server:
         """Return the server for a window's episode; a new episode gets one with the fewest episodes."""
@@ -197,7 +222,7 @@ class StepScorer:
         return self._server_of[window.episode]
 
     async def _request(
-        self, windows: Sequence[Window], sent: Sequence[UInt8Array], outputs: Sequence[str], call: Call
+        self, windows: Sequence[Window], sent: Sequence[UInt8Array], outputs: Collection[str], call: Call
     ) -> Sequence[ProgressResult]:
         request_id = next(call.request_ids)
         num_bytes = _padded_bytes(len(windows), len(sent), sent[0].nbytes if sent else 0)
@@ -215,10 +240,11 @@ class StepScorer:
         return await self._scorer.outcomes(samples, call)
 
 
-async def _hashed(windows: Sequence[Window]) -> None:
+def _hash(windows: Sequence[Window]) -> None:
     """Compute the digests of the frames in these windows."""
-    num_new = sum(w.num_bytes // len(w.frames) for w in windows)  # about one frame in each window is new
-    await off_loop(num_new, lambda: [frame.digest for window in windows for frame in window.frames])
+    for window in windows:
+        for frame in window.frames:
+            frame.digest  # noqa: B018  computed at the first use
 
 
 def _padded_bytes(num_windows: int, num_frames: int, frame_bytes: int) -> int:

@@ -19,7 +19,7 @@ from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array, 
 from rfm_client.episodes.options import EpisodeOptions, StepScore, StepValue
 from rfm_client.frames.fit_to_checkpoint import resize_frames
 from rfm_client.frames.orientation import FUSES, Fuse
-from rfm_client.frames.sampling import Prefix, Sampling
+from rfm_client.frames.sampling import Prefix
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +60,6 @@ class Window:
         """The window as a sample, with all pixels. Raises InvalidSampleError."""
         frames = np.stack([frame.pixels for frame in self.frames])
         return ProgressSample(Trajectory(frames=frames, task=self.task))
-
-
-def prefix_windows(trajectory: Trajectory, sampling: Sampling) -> list[Window]:
-    """Return the window of each prefix of a trajectory of frames. Copies no frame. Raises InvalidSampleError."""
-    frames = [Frame(pixels) for pixels in cast("UInt8Array", trajectory.frames)]
-    shown = ([frames[index] for index in sampling.prefix(t).indices] for t in range(len(frames)))
-    return [Window(tuple(each), trajectory.task, trajectory) for each in shown]
 
 
 class Steps:
