@@ -35,12 +35,17 @@ class DecoderLayer:
         self._groups = attention.num_key_value_groups
         num_keys = attention.config.num_key_value_heads
         self._num_heads = [num_keys * self._groups, num_keys]
-        self._norm = None
+        self._norm, self._sources = None, _sources(layer)
         if hasattr(attention, "q_norm"):  # Qwen3-VL
-            norms = zip((attention.q_norm, attention.k_norm), self._num_heads, strict=True)
-            weight = torch.cat([norm.weight.detach().expand(count, -1) for norm, count in norms])
+            # Kept, so that no other weight gets their addresses.
+            self._weights = [norm.weight.detach() for norm in (attention.q_norm, attention.k_norm)]
+            weight = torch.cat([w.expand(count, -1) for w, count in zip(self._weights, self._num_heads, strict=True)])
             self._norm = deepcopy(attention.q_norm)
             self._norm.weight = nn.Parameter(weight, requires_grad=False)  # [heads of queries and keys, E]
+
+    def is_of(self, layer: Any) -> bool:
+        """True if made from this layer, with these weights of its norms, of which it holds a copy."""
+        return self._sources == _sources(layer)
 
     def __call__(self, states: Tensor, turn: tuple[Tensor, Tensor], mask: Tensor | None, cache: Cache | None) -> Tensor:
         """Return the states behind the layer, [B, L, D] -> [B, L, D].
@@ -92,9 +97,23 @@ def turn_of(language: Any, states: Tensor, position_ids: Tensor) -> tuple[Tensor
 
 
 def decoder_layers(language: Any) -> list[DecoderLayer]:
-    """Return the layers of transformers' language model, made at the first call."""
-    made: list[DecoderLayer] | None = vars(language).get("_decoder_layers")
-    if made is None:
-        made = [DecoderLayer(layer, number) for number, layer in enumerate(language.layers)]
+    """Return the layers of transformers' language model, made again if layers or weights of norms have changed.
+
+    Raises RuntimeError if that happens while a CUDA graph is captured: a copy made then has no values yet.
+    """
+    made: list[DecoderLayer] = vars(language).get("_decoder_layers", [])
+    layers = list(language.layers)
+    if len(made) != len(layers) or not all(map(DecoderLayer.is_of, made, layers)):
+        if torch.cuda.is_available() and torch.cuda.is_current_stream_capturing():
+            raise RuntimeError("expected the weights of the last pass, got others")
+        made = [DecoderLayer(layer, number) for number, layer in enumerate(layers)]
         vars(language)["_decoder_layers"] = made
     return made
+
+
+def _sources(layer: Any) -> tuple[object, ...]:
+    """Return what differs once the layer, or a weight that ``DecoderLayer`` copies, is another."""
+    modules = layer._modules["self_attn"]._modules  # as attributes, they would take 0.2 ms per pass
+    weights = [modules[name]._parameters["weight"] for name in ("q_norm", "k_norm") if name in modules]
+    # Inference tensors count no changes.
+    return layer, *((w.data_ptr(), object() if w.is_inference() else w._version) for w in weights)

@@ -28,7 +28,7 @@ MIN_CHARACTERS = 16
 _RESTRICTED = "model-repository,logging,trace"
 _RESTRICTIONS = {"HTTP": "http-restricted-api", "gRPC": "grpc-restricted-protocol"}  # tritonserver's options
 _SCORING = "inference"  # the restricted API
-_OF_CALLERS = f"{_SCORING},shared-memory"  # the APIs that callers use with the API key; health and names need none
+_OF_CALLERS = _SCORING, "shared-memory"  # the APIs that callers use with the API key; health and names need none
 NO_KEY, KEY, CERTIFICATE = "no key needed", "needs a key", "needs a client certificate"  # what a port's callers need
 _RANDOM_BYTES = 32
 _VISIBLE = re.compile("[!-~]*")  # characters that a header can carry unchanged
@@ -58,19 +58,21 @@ def restrictions(key: str) -> list[str]:
 def callers_restrictions(key: str | None, given: Sequence[str]) -> list[str]:
     """Return tritonserver arguments that refuse callers without ``Authorization: Bearer KEY``. None: no key
 
-    given: other arguments; where they restrict scoring themselves, they win
+    Raises InvalidValueError if ``given``, other arguments, restrict the same APIs: Triton takes one key for each.
     """
-    return [
-        f"--{option}={_OF_CALLERS}:{AUTHORIZATION}=Bearer {key}"
-        for option in _RESTRICTIONS.values()
-        if key is not None and not _asks_callers(option, given)
-    ]
+    if key is None:
+        return []
+    for option in _RESTRICTIONS.values():
+        expected = f"no --{option} for {' or '.join(_OF_CALLERS)} beside it"
+        require("--api-key-file", not _restricted(option, given) & {*_OF_CALLERS}, expected, "both: leave out one")
+    return [f"--{option}={','.join(_OF_CALLERS)}:{AUTHORIZATION}=Bearer {key}" for option in _RESTRICTIONS.values()]
 
 
-def _asks_callers(option: str, arguments: Sequence[str]) -> bool:
-    """True if one of the arguments is this option and restricts scoring."""
-    given = (each.partition("=")[2] for each in arguments if each.startswith(f"--{option}="))
-    return any(_SCORING in each.partition(":")[0].split(",") for each in given)
+def _restricted(option: str, arguments: Sequence[str]) -> set[str]:
+    """Return the APIs that the arguments restrict with this option, which Triton also takes abbreviated."""
+    given = (each.partition("=") for each in arguments)
+    apis = (value.partition(":")[0].split(",") for name, _, value in given if f"--{option}".startswith(name))
+    return {api.strip() for each in apis for api in each}
 
 
 def http_headers(key: str | None) -> Mapping[str, str]:
@@ -200,7 +202,9 @@ class Endpoints:
         asks = dict.fromkeys(("gRPC", "HTTP", "metrics"), NO_KEY)
         if self.grpc_tls is not None and self.grpc_tls.client_ca is not None:
             asks["gRPC"] = CERTIFICATE
-        asks |= {name: KEY for name, option in _RESTRICTIONS.items() if _asks_callers(option, more_arguments)}
+        for name, option in _RESTRICTIONS.items():
+            if _SCORING in _restricted(option, more_arguments):
+                asks[name] = KEY if asks[name] == NO_KEY else f"{asks[name]} and a key"
         urls = {"gRPC": self.grpc_url, "HTTP": self.http_url, "metrics": self.metrics_url}
         return {name: (url, asks[name]) for name, url in urls.items()}
 

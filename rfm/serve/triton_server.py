@@ -32,7 +32,7 @@ from rfm.serve.processes import (
 )
 from rfm.serve.repository import Config, check_models, models_in, no_models, stage
 from rfm.serve.repository_api import INDEX_PATH, versions_of
-from rfm_client.contract.triton import bearer_headers
+from rfm_client.contract.triton import bearer_headers, over_http
 
 MAX_HTTP_BYTES = 256 * 2**20  # for a request body; gRPC accepts 2 GiB
 # Refused besides the options that rfm serve sets: their aliases, and options that break a start.
@@ -142,11 +142,11 @@ class TritonServer:
     admin_key: str = field(default_factory=new_key, repr=False)
     api_key: str | None = field(default=None, repr=False)
     accepts_known_vulnerabilities: bool = False
-    more_arguments: Sequence[str] = ()
+    more_arguments: Sequence[str] = field(default=(), repr=False)  # may contain keys
 
     def __post_init__(self) -> None:
         headers = {**http_headers(self.admin_key), **(bearer_headers(self.api_key) if self.api_key else {})}
-        self.http = Http(self.endpoints.http_host, self.endpoints.http_port, headers)
+        self.http = Http(self.endpoints.http_host, self.endpoints.http_port, over_http(headers))
         self._claim: Claim | None = None
         self._signal: int | None = None  # the last signal sent
         self._group: ProcessGroup | None = None  # the newest
@@ -313,7 +313,8 @@ class TritonServer:
 
     def _environment(self) -> dict[str, str]:
         own = {name: value for name, value in os.environ.items() if not SECRET.fullmatch(name)}
-        of_models = {HANG_VARIABLE: str(self.hang_s)}
+        # No bytecode, even if a copy of the repository has lost NO_BYTECODE. Triton's stubs for some Pythons ignore it.
+        of_models = {HANG_VARIABLE: str(self.hang_s), "PYTHONDONTWRITEBYTECODE": "1"}
         return {**short_spin(own), **own, **self.installation.environment, **of_models}
 
 

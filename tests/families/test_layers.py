@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -144,14 +146,73 @@ def test_decoder_layers_give_the_bits_of_transformers_layers(name: str, dtype: t
     states = torch.randn(2, 33, language.config.hidden_size).to(dtype)
     position_ids = torch.randint(0, 40, (3, 2, 33))
     mask = (torch.rand(2, 1, 33, 33) < 0.5) | torch.eye(33, dtype=torch.bool) if is_masked else None
-    with torch.inference_mode():
-        turn = turn_of(language, states, position_ids)
-        theirs = language.rotary_emb(states, position_ids)
-        for layer, ours in zip(language.layers, decoder_layers(language), strict=True):
-            expected = layer(states, position_embeddings=theirs, attention_mask=mask)
-            expected = expected[0] if isinstance(expected, tuple) else expected
-            assert torch.equal(ours(states, turn, mask, None), expected)
+    assert_equals_transformers(language, states, position_ids, mask)
     assert not [key for key in language.state_dict() if "_decoder_layers" in key]
+
+
+@torch.inference_mode()
+def assert_equals_transformers(language: Any, states: Tensor, position_ids: Tensor, mask: Tensor | None = None) -> None:
+    turn = turn_of(language, states, position_ids)
+    theirs = language.rotary_emb(states, position_ids)
+    for layer, ours in zip(language.layers, decoder_layers(language), strict=True):
+        expected = layer(states, position_embeddings=theirs, attention_mask=mask)
+        expected = expected[0] if isinstance(expected, tuple) else expected
+        assert torch.equal(ours(states, turn, mask, None), expected)
+
+
+def _normal(language: Any, **options: bool) -> None:
+    drawn = {name: torch.randn_like(value) for name, value in language.state_dict().items()}
+    language.load_state_dict(drawn, **options)
+
+
+@torch.inference_mode()
+def _double(language: Any) -> None:
+    for layer in language.layers:
+        layer.self_attn.k_norm.weight.mul_(2)
+
+
+def _of_inference(language: Any) -> None:
+    """Weights whose changes PyTorch does not count."""
+    with torch.inference_mode():
+        _normal(language, assign=True)
+    decoder_layers(language)
+    _double(language)
+
+
+CHANGES: dict[str, Callable[[Any], object]] = {
+    "in place": _double,
+    "loaded": _normal,
+    "loaded and assigned": partial(_normal, assign=True),
+    "made in inference mode": _of_inference,
+    "rounded": lambda language: language.bfloat16().float(),
+    "another layer": lambda language: language.layers.insert(0, language.layers.pop(-1)),
+    "one layer less": lambda language: language.layers.pop(0),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_decoder_layers_follow_changed_weights(change: Callable[[Any], object]) -> None:
+    language: Any = load(PLAIN).build(torch.float32).eval().model.language_model
+    _normal(language)
+    states, position_ids = torch.randn(1, 5, language.config.hidden_size), torch.randint(0, 9, (3, 1, 5))
+    assert_equals_transformers(language, states, position_ids)
+    made = decoder_layers(language)
+    assert decoder_layers(language) is made
+    change(language)
+    assert_equals_transformers(language, states, position_ids)
+    assert decoder_layers(language) is not made
+
+
+def test_no_weights_are_copied_while_a_cuda_graph_is_captured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in for the capture."""
+    language: Any = load(PLAIN).build(torch.float32).model.language_model
+    decoder_layers(language)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: True)
+    decoder_layers(language)
+    _double(language)
+    with pytest.raises(RuntimeError, match="expected the weights of the last pass, got others"):
+        decoder_layers(language)
 
 
 def test_the_first_calls_of_all_functions_of_mkl_are_made_by_one_thread() -> None:

@@ -5,7 +5,12 @@ from __future__ import annotations
 
 import re
 import shutil
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -13,12 +18,15 @@ import pytest
 
 from commands import REPOSITORY
 from gateways import answers
-from rfm.serve.access import callers_restrictions, free_ports
+from in_process import rfm
+from rfm.serve.access import Endpoints, callers_restrictions, free_ports
+from rfm.serve.installation import find_installation
 from rfm.serve.repository_api import RepositoryApi, RepositoryApiError
+from rfm.serve.triton_server import TritonServer
 from rfm_client import AccessDeniedError, ProgressSample, RewardClient
 from rfm_client.contract.triton import bearer_headers
 from rfm_client.contract.wire import PROGRESS, encode_samples
-from servers import KEY, administered, wait_for
+from servers import KEY, PATIENCE_S, Quiet, administered, wait_for, web_server
 from trajectories import random_trajectory
 
 API_KEY = "the-key-of-all-callers="
@@ -81,7 +89,51 @@ def _document() -> dict[str, object]:
     }
 
 
-def test_a_door_s_own_key_stays() -> None:
-    own = "--grpc-restricted-protocol=health,inference:a=b"
-    assert callers_restrictions("k", [own]) == ["--http-restricted-api=inference,shared-memory:authorization=Bearer k"]
-    assert callers_restrictions(None, []) == []
+@pytest.mark.parametrize("apis", ["health,inference", "shared-memory", "health, inference"])
+@pytest.mark.parametrize("option", ["grpc-restricted-protocol", "http-restricted-api", "http-restr"])
+def test_a_second_key_for_callers_is_refused(option: str, apis: str, tmp_path: Path) -> None:
+    """Triton would not start, or one port would ask for another key than the other."""
+    file = tmp_path / "api.key"
+    file.touch(0o600)
+    file.write_text(API_KEY)
+    done = rfm("serve", str(REPOSITORY), "--api-key-file", str(file), "--", f"--{option}={apis}:header=another")
+    told = r"rfm: --api-key-file: expected no --\S+ for inference or shared-memory beside it, got both: leave out one\n"
+    assert done.exit_code == 1
+    assert re.fullmatch(told, done.stderr)
+    assert f" --{option}" in done.stderr
+
+
+def test_a_key_for_other_apis_stays() -> None:
+    both = callers_restrictions("k", ["--grpc-restricted-protocol=health:a=b"])
+    apis = "inference,shared-memory:authorization=Bearer k"
+    assert both == [f"--http-restricted-api={apis}", f"--grpc-restricted-protocol={apis}"]
+    assert callers_restrictions(None, ["--http-restricted-api=inference:a=b"]) == []
+
+
+class Recorder(Quiet, BaseHTTPRequestHandler):
+    """Stands in for a server, whose requests it keeps."""
+
+    def __init__(self, kept: list[Mapping[str, str]], *connection: Any) -> None:
+        self.kept = kept
+        super().__init__(*connection)
+
+    def do_GET(self) -> None:
+        self.kept.append(dict(self.headers.items()))
+        self.send_response(200)
+        self.end_headers()
+
+
+def test_over_http_the_key_is_in_the_usual_header_alone_and_in_no_description() -> None:
+    """Logs of proxies redact no other header."""
+    kept: list[Mapping[str, str]] = []
+    with web_server(partial(Recorder, kept)) as url:
+        endpoints = replace(Endpoints.free(), http_port=int(url.rpartition(":")[2]))
+        arguments = callers_restrictions(API_KEY, [])
+        server = TritonServer(REPOSITORY, endpoints, find_installation(), api_key=API_KEY, more_arguments=arguments)
+        server.http.request("GET", "/", PATIENCE_S)
+        with RewardClient(url, api_key=API_KEY) as client:
+            client.is_ready()
+    shown = [[name.lower() for name, value in headers.items() if API_KEY in value] for headers in kept]
+    assert shown == [["authorization"]] * len(kept)
+    assert len(kept) > 1
+    assert API_KEY not in repr(server)

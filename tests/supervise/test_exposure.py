@@ -16,7 +16,7 @@ from commands import REPOSITORY, is_alive, nothing_left_behind
 from in_process import rfm
 from rfm.config import ServeConfig
 from rfm.serve import access
-from rfm.serve.access import PORTS, Endpoints, GrpcTls, check_version, free_ports
+from rfm.serve.access import PORTS, Endpoints, GrpcTls, callers_restrictions, check_version, free_ports
 from rfm.serve.installation import ServerStartError
 from rfm.serve.processes import children_of
 from rfm.serve.triton_server import TritonServer
@@ -90,6 +90,11 @@ ASKS: dict[str, tuple[bool, list[str], dict[str, str]]] = {
         False,
         ["--grpc-restricted-protocol=health,inference:a=b", "--http-restricted-api=inference:a=b"],
         {"gRPC": "needs a key", "HTTP": "needs a key"},
+    ),
+    "client certificates and a key": (
+        True,
+        callers_restrictions("k", []),
+        {"gRPC": "needs a client certificate and a key", "HTTP": "needs a key"},
     ),
     "a key for health alone": (False, ["--grpc-restricted-protocol=health:inference=b"], {}),
 }

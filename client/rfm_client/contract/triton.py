@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, TypeAlias, TypeVar
 
 from rfm_client.contract import errors
@@ -174,6 +174,11 @@ def is_denied(status: str, message: str) -> bool:
 def bearer_headers(key: str) -> dict[str, str]:
     """Return the headers with an API key: the usual one, and the metadata that Triton expects over gRPC."""
     return dict.fromkeys((AUTHORIZATION, f"{METADATA_PREFIX}{AUTHORIZATION}"), f"Bearer {key}")
+
+
+def over_http(headers: Mapping[str, str]) -> dict[str, str]:
+    """Return the headers without Triton's gRPC metadata: proxies redact no keys under those names."""
+    return {name: value for name, value in headers.items() if not name.startswith(METADATA_PREFIX)}
 
 
 def denied(url: str, status: str, message: str) -> errors.AccessDeniedError:

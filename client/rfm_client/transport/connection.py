@@ -63,7 +63,7 @@ class Credentials:
     ca_file: CA certificates (PEM) that may vouch for the server; None: the system's
     client_certificate, client_key: files (PEM) that identify this client (mutual TLS); both or neither
     headers: sent with every request, over gRPC as metadata
-    api_key: sent with every request as ``Authorization: Bearer KEY``, and as the metadata that Triton asks for
+    api_key: sent with every request as ``Authorization: Bearer KEY``; over gRPC also as metadata for Triton
     """
 
     ca_file: str | Path | None = None

@@ -15,6 +15,7 @@ from tritonclient.http.aio import InferenceServerClient
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 from rfm_client.contract.errors import InferenceFailedError
+from rfm_client.contract.triton import over_http
 from rfm_client.contract.wire import Tensors
 from rfm_client.transport.connection import SECURE_SCHEMES, Credentials
 from rfm_client.transport.shared_memory import Region
@@ -35,7 +36,7 @@ class HttpClient(InferenceServerClient):  # type: ignore[misc]  # untyped
         is_secure = scheme in SECURE_SCHEMES
         context = credentials.ssl_context if is_secure else None
         super().__init__(address, conn_limit=0, conn_timeout=None, ssl=is_secure, ssl_context=context)
-        self._own_headers = {**_AS_IT_IS, **credentials.shown}
+        self._own_headers = {**_AS_IT_IS, **over_http(credentials.shown)}
 
     async def score(
         self,
