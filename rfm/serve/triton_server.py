@@ -87,7 +87,7 @@ def _knows(program: Path, option: str) -> bool:
 POLL_S = 0.1
 LOAD_S = 1800.0
 STOP_S = 10.0  # for requests in flight; Triton also waits for open HTTP connections and dead model processes
-_NEVER_S = 3600  # Triton's own limit for a stop; when it expires, Triton crashes under its requests
+_NEVER_S = 3600  # Triton's own limit for a stop, which must not expire: it ends without regard to its requests
 ANSWER_TIMEOUT_S = 10.0  # while the server starts
 SECRET = re.compile("RFM_.*_KEY")  # variables withheld from Triton and the model processes
 _REMEDIES = {  # by pattern in the reason why a model is not loaded
