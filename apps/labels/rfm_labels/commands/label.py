@@ -409,7 +409,7 @@ class LabelCommand:
         """Where the label files are, without opening the dataset. Raises DatasetError for one that is not local."""
         path = Path(self.source)
         remedy = "none: name the folder of its labels with --output"
-        require(path, path.exists() or labels.output is not None, "a local dataset", remedy)
+        require(self.source, path.exists() or labels.output is not None, "a local dataset", remedy)
         return Outputs(labels.output or (path if path.is_dir() else path.parent), labels, label_prefix(path))
 
     def _list(self) -> None:
