@@ -35,7 +35,7 @@ BOUNDS = (-0.03, 1.03)  # limits for an axis from 0 to 1
 
 
 class Canvas(NamedTuple):
-    """Width and height of a figure of a fixed shape, in inches of 8-point text, and its resolution."""
+    """Size and resolution of a figure. Its text is 8 points high, so a larger canvas shows smaller text."""
 
     width_in: float
     height_in: float

@@ -51,7 +51,7 @@ def shown(url: str, *asked: object, code: ExitCode = ExitCode.OK) -> tuple[set[s
     path = f"{RFM_CLIENT.parent}:{os.environ['PATH']}"  # or commands would begin with the program's folder
     result = invoke(*asked, "--url", url, env={"COLUMNS": f"{WIDTH}", "PATH": path})
     assert result.exit_code == code, result.output
-    lines = [line for line in result.stdout.splitlines() if not line.endswith(NAMES)]  # paths are never cut
+    lines = [line for line in result.stdout.splitlines() if line.strip() not in map(str, asked)]  # paths are never cut
     assert max(map(len, lines)) <= WIDTH
     return {*result.stdout.split()}, result.stdout
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labelling import BrightnessScorer, PickyScorer
+from labelling import BrightnessScorer, ByCurve, PickyScorer
 from rfm_client import UInt8Array
 from rfm_client.frames import sampling
 from rfm_labels import Dataset, DatasetEpisode, LabelOptions, Report, label, scoring
@@ -66,14 +66,18 @@ def peak_videos(dataset: LongVideos, options: LabelOptions, scorer: BrightnessSc
         tracemalloc.stop()
 
 
-MODES: dict[str, dict[str, Any]] = {"prefixes": {"frames": 2}, "one pass": {"mode": "whole"}}
+MODES: dict[str, tuple[type[BrightnessScorer], dict[str, Any]]] = {
+    "prefixes": (BrightnessScorer, {"frames": 2}),
+    "prefixes at once": (ByCurve, {"frames": 2}),
+    "one pass": (BrightnessScorer, {"mode": "whole"}),
+}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", MODES.values(), ids=MODES)
-def test_each_frame_of_a_video_is_held_once(output: Path, mode: dict[str, Any]) -> None:
+@pytest.mark.parametrize(("kind", "mode"), MODES.values(), ids=MODES)
+def test_each_frame_of_a_video_is_held_once(output: Path, kind: type[BrightnessScorer], mode: dict[str, Any]) -> None:
     options = LabelOptions(output=output, workers=1, formats=("progress",), **mode)
-    peak, report = peak_videos(LongVideos(output, 1), options, BrightnessScorer(max_frames=None))
+    peak, report = peak_videos(LongVideos(output, 1), options, kind(max_frames=None))
     assert report.summary is not None
     assert report.summary.final_progress.tolist() == pytest.approx([(NUM_FRAMES - 1) % 256 / 255])
     assert 1 <= peak < 1.7

@@ -139,6 +139,21 @@ def test_a_server_that_is_gone_stops_the_run(output: Path, undisturbed: list[byt
     goes_on(output, undisturbed)
 
 
+def test_an_episode_that_is_scored_at_once_ends_when_the_run_stops(output: Path) -> None:
+    both_began = threading.Barrier(2, timeout=60)
+
+    class Gone(BrightnessScorer):
+        def curve(self, trajectory: Any, sampling: Any, go_on: Callable[[], None]) -> ProgressResult:
+            if both_began.wait() == 0:
+                raise ServerUnavailableError("no server")
+            while True:
+                go_on()
+
+    with pytest.raises(ServerUnavailableError, match=r"^no server$"):
+        label(open_dataset(ROOT), Gone(), LabelOptions(output=output, workers=2, **FEW))
+    assert parts_of(output) == []
+
+
 def full_disk(monkeypatch: pytest.MonkeyPatch, after: int) -> None:
     """Files reach the disk ``after`` times."""
     synced, counts = os.fsync, itertools.count(1)

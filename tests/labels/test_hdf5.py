@@ -19,7 +19,7 @@ from pyarrow import parquet
 import hdf5_writers as writers
 from client_commands import invoke
 from hdf5_writers import TASK
-from labelling import BrightnessScorer, Notes
+from labelling import BrightnessScorer, ByCurve, Notes
 from rfm_client import FrameSize, InvalidSampleError, ProgressResult, ProgressSample
 from rfm_client.frames import Correction, resize_frames
 from rfm_labels import CheckpointFacts, DatasetError, LabelOptions, find_label_files, label, open_dataset
@@ -208,6 +208,10 @@ class Comparer(BrightnessScorer):
         return super()._result(sample)
 
 
+class ComparerByCurve(ByCurve, Comparer):
+    """Is asked for all prefixes at once."""
+
+
 def test_views_and_a_goal_are_shown_beside_one_camera_and_stand_in_the_provenance(tmp_path: Path) -> None:
     Image.fromarray(FRAMES[1]).save(tmp_path / "done.png")
     front, wrist = CAMERAS
@@ -224,6 +228,16 @@ def test_views_and_a_goal_are_shown_beside_one_camera_and_stand_in_the_provenanc
     provenance = json.loads(parquet.read_schema(report.files[0]).metadata[b"rfm.provenance"])
     assert (provenance["cameras"], provenance["views"]) == ([front], [wrist, front])
     assert provenance["goal"]["picture"] == "done.png"
+
+    by_curve = ComparerByCurve()
+    own = {**vars(options), "mode": "prefix", "frames": 2, "name": "prefixes"}
+    sampling = label(dataset, by_curve, LabelOptions(**own)).plan.recipe.sampling
+    assert len(by_curve.shown) == len(small[0])
+    for t, sample in enumerate(by_curve.shown):
+        asked = sample.trajectory
+        for array, frames in zip((asked.positions, *asked.views), small, strict=True):
+            np.testing.assert_array_equal(array, frames[sampling.prefix(t).indices])
+        np.testing.assert_array_equal(asked.goal, shown.goal)
 
     last = LabelOptions(**several, cameras=(front,), goal="last", output=tmp_path / "last")
     recipe = label(dataset, scorer, last).plan.recipe

@@ -21,6 +21,7 @@ from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 
 TOY = LEROBOT / "toy_v30_many"
 PROGRESS = "rfm_progress.parquet"
+NO_LABELS = "label it first, or name their --output"
 EPISODE_FRAMES = [episode.num_frames for episode in open_dataset(TOY).episodes]
 
 
@@ -179,12 +180,58 @@ def test_labels_are_listed_and_deleted_by_name_and_finished_episodes_stay(output
     (output / "third_progress.parquet").write_bytes(b"of another program")
     listed = rfm_client("label", TOY, "--output", output, "--list").stdout.splitlines()[2:]
     assert [line.split() for line in listed if line] == [
-        ["rfm", "toy/brightness", "1"],
-        ["other", "toy/brightness", "1"],
-        ["third", "-", "-"],
+        ["rfm", "toy/brightness", "1", "-"],
+        ["other", "toy/brightness", "1", "rfm"],
+        ["third", "-", "-", "-"],
     ]
     shutil.rmtree(output / ".rfm_parts")
     assert "expected --yes for labels that must be scored again" in rfm_client(*remove).stderr
     assert (output / PROGRESS).exists()
     assert rfm_client(*remove, "--yes").exit_code == 0
     assert "expected labels of rfm-client, got others" in rfm_client(*remove[:-1], "third").stderr
+
+
+REFUSED = {  # words after --remove, and the refusal
+    "no name": (["", "--yes"], "'--remove': expected 1 to 64 letters, digits, _ or -, got ''"),
+    "some episodes": (["rfm", "--episodes", "0"], "--remove excludes --episodes"),
+    "two names": (["rfm", "--name", "other"], "--remove excludes --name"),
+    "a dataset on the Hub": (
+        ["rfm"],
+        "org/name: expected a local dataset, got none: name the folder of its labels with",
+    ),
+}
+
+
+@pytest.mark.parametrize(("words", "message"), REFUSED.values(), ids=REFUSED)
+def test_a_removal_that_may_mean_something_else_is_refused(output: Path, words: list[str], message: str) -> None:
+    source = ["org/name"] if "org" in message else [TOY, "--output", output]
+    refused = rfm_client("label", *source, "--remove", *words, env={"COLUMNS": "200"})
+    assert refused.exit_code != 0
+    assert message in refused.stderr
+
+
+def test_labels_of_a_folder_of_hdf5_files_are_listed_and_deleted_together(tmp_path: Path) -> None:
+    folder = tmp_path / "demos"
+    folder.mkdir()
+    files = [write_robomimic(folder / f"{name}.hdf5", [{"front": video(4, 0)}]) for name in "abc"]
+    for file in (files[0], files[2]):
+        labelled(file, folder, cameras=("front",), alias="sarm_progress")
+    listed = rfm_client("label", folder, "--list")
+    assert listed.stderr.splitlines()[-3:-1] == [
+        f"rfm-client: {line}" for line in (files[1], f"{files[1]}: no labels in {folder}: {NO_LABELS}")
+    ]
+    assert [line.split() for line in listed.stdout.splitlines() if "toy/" in line] == [
+        ["rfm", "toy/brightness", "1", "-"],
+        ["sarm", "toy/brightness", "1", "rfm"],
+    ] * 2
+    shutil.rmtree(folder / ".rfm_parts")
+    before = labels(folder)
+    assert (
+        "expected --yes for labels that must be scored again" in rfm_client("label", folder, "--remove", "rfm").stderr
+    )
+    assert labels(folder) == before
+    done = rfm_client("label", folder, "--remove", "rfm", "--yes")
+    assert (done.exit_code, len(done.stdout.splitlines())) == (0, 4)
+    assert labels(folder).keys() == {"a.sarm_progress.parquet", "c.sarm_progress.parquet"}
+    for name in labels(folder):
+        assert f"note: {folder / name} has the same labels and stays; delete it, too, if it is an alias" in done.stderr

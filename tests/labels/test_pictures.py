@@ -72,6 +72,7 @@ def test_numbers_in_names_order_the_frames(tmp_path: Path, names: Sequence[str])
 SKIPPING = {  # names of pictures, and the pictures around a gap
     "a count": (["f_0001.png", "f_0002.png", "f_0004.png"], "f_0002.png and f_0004.png;"),
     "every fifth": (["0.png", "5.png", "10.png", "25.png", "30.png", "40.png"], "10.png and 25.png, and 1 more"),
+    "a clock in ms at 30 Hz": ([f"{ms}.png" for ms in (0, 33, 66, 100, 133, 166, 233)], "166.png and 233.png;"),
     "times of a clock": ([f"{ms}.png" for ms in (1000, 1031, 1068, 1101, 1190)], None),
 }
 

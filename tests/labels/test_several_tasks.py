@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from pyarrow import parquet
 
-from labelling import LEROBOT, WRIST, BrightnessScorer, Notes, change_column, tasks_of
+from labelling import LEROBOT, WRIST, BrightnessScorer, ByCurve, Notes, change_column, tasks_of
 from rfm_client import ProgressResult, ProgressSample, Trajectory, UInt8Array
 from rfm_labels import CheckpointFacts, DatasetError, LabelOptions, label, open_dataset, read_episode_labels
 from rfm_labels.advantage import recap_advantages
@@ -48,6 +48,10 @@ class SinceTheFirst(BrightnessScorer):
         return ProgressResult(progress=means - means[0], success=means)
 
 
+class SinceTheFirstByCurve(ByCurve, SinceTheFirst):
+    """Is asked for all prefixes of a stretch at once."""
+
+
 class Rising(BrightnessScorer):
     """Progress rises from 0.1 to 0.9 over the frames of a sample."""
 
@@ -78,11 +82,13 @@ def options(output: Path, **more: Any) -> LabelOptions:
 
 
 @pytest.mark.parametrize("encodes", [False, True])
-@pytest.mark.parametrize("mode", ["prefix", "whole"])
+@pytest.mark.parametrize(
+    ("mode", "kind"), [("prefix", SinceTheFirst), ("prefix", SinceTheFirstByCurve), ("whole", SinceTheFirst)]
+)
 def test_each_stretch_of_frames_is_scored_as_an_episode_of_its_task(
-    root: Path, output: Path, mode: Any, encodes: bool
+    root: Path, output: Path, mode: Any, kind: type[SinceTheFirst], encodes: bool
 ) -> None:
-    dataset, notes, scorer = open_dataset(root), Notes(), SinceTheFirst(encodes)
+    dataset, notes, scorer = open_dataset(root), Notes(), kind(encodes)
     scorer.max_frames = None
     sentences = tasks_of(root)
     first = dataset.episode(0)
@@ -97,7 +103,7 @@ def test_each_stretch_of_frames_is_scored_as_an_episode_of_its_task(
     np.testing.assert_allclose(table["progress"].to_numpy()[: len(means)], means - since, atol=1e-5)
     assert table["frame_index"].to_pylist()[: len(means)] == list(range(len(means)))
     assert set(scorer.asked) == {sentences[0], sentences[4], dataset.episode(1).task}
-    assert [line for line in notes.lines if line.startswith("tasks: several in 1 episode: each stretch")]
+    assert [line for line in notes.lines if line.startswith("tasks: they change within 1 episode: each stretch")]
 
 
 def gains(table: Any, chunk: int) -> list[float]:

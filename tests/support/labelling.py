@@ -21,6 +21,7 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, RewardError, Trajectory, UInt8Array
+from rfm_client.frames import Sampling
 from rfm_labels import CheckpointFacts, DatasetEpisode, LabelOptions, RayOptions, Scorer, Watch, label, open_dataset
 from rfm_labels.datasets.stored_files import digest_of as digest_of
 
@@ -67,6 +68,17 @@ class BrightnessScorer:
         frames = sample.trajectory.frames
         assert frames is not None
         return ProgressResult(progress=brightness(frames), success=redness(frames))
+
+
+class ByCurve(BrightnessScorer):
+    """Is asked for the prefixes of an episode at once, as ``ClientScorer`` is."""
+
+    def curve(self, trajectory: Trajectory, sampling: Sampling, go_on: Callable[[], None]) -> ProgressResult:
+        results: list[ProgressResult] = []
+        for samples in sampling.parts(trajectory):
+            go_on()
+            results += self.evaluate(samples)
+        return sampling.joined(results)
 
 
 class PickyScorer(BrightnessScorer):

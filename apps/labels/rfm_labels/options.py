@@ -72,6 +72,12 @@ def parse_shard(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
+def check_name(setting: str, name: str | None) -> None:
+    """Raise ConfigError unless a reward or alias may have this name."""
+    if name is not None and not _NAME.fullmatch(name):
+        raise ConfigError.at(setting, "1 to 64 letters, digits, _ or -", repr(name))
+
+
 def _names(text: str) -> tuple[str, ...]:
     return tuple(text.split(",")) if text else ()
 
@@ -163,9 +169,7 @@ class LabelOptions(Settings):
                 object.__setattr__(self, name, numbers)
         super().__post_init__()
         for name in ("name", "alias"):
-            value = getattr(self, name)
-            if value is not None and not _NAME.fullmatch(value):
-                raise ConfigError.at(name, "1 to 64 letters, digits, _ or -", repr(value))
+            check_name(name, getattr(self, name))
         if not self.formats or set(self.formats) - set(FORMATS):
             raise ConfigError.at("formats", f"some of {', '.join(FORMATS)}", ", ".join(self.formats) or "none")
         if len(set(self.cameras)) != len(self.cameras):

@@ -371,7 +371,7 @@ def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: 
     several = sum(bool(episode.tasks) for episode in episodes)
     if several:
         how = "each stretch of frames with one task is scored by itself (--several-tasks first: all by the first task)"
-        watch.note(f"tasks: several in {counted(several, 'episode')}: {how}")
+        watch.note(f"tasks: they change within {counted(several, 'episode')}: {how}")
         if "progress" in options.formats:
             own = "the scores are in the column progress"
             watch.note(f"progress_sparse: the sum of the gains in an episode's tasks, as LeRobot's RA-BC needs; {own}")
@@ -398,7 +398,7 @@ def _task_lines(dataset: Dataset, episodes: Sequence[DatasetEpisode]) -> list[st
         lines.append(f"tasks: --task for all {counted(len(episodes), 'episode')}")
     elif given.text is not None:
         num_given = sum(any(task == given.text for task, _ in episode.stretches) for episode in episodes)
-        lines.append(f"tasks: their own for {counted(len(episodes) - num_given, 'episode')}, --task for {num_given}")
+        lines.append(f"tasks: {counted(num_given, 'episode')} got --task, {len(episodes) - num_given} kept their own")
     known = dict.fromkeys(task for episode in episodes for task, _ in episode.stretches)
     words = [task for task in known if task.isascii() and len(task.split()) == 1]  # such as ``pick_place_cup``
     if words:

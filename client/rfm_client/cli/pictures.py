@@ -56,7 +56,7 @@ class Panel:
 
     @property
     def places(self) -> npt.NDArray[np.float64]:
-        """float64 [S], where the strip's frames stand on the time axis: evenly spaced, close to their times."""
+        """Where the strip's frames stand on the time axis, float64 [S]: evenly spaced, and so only near their times."""
         count = len(self.strip_positions)
         return self.strip_positions if count == 1 else np.linspace(self.positions[0], self.positions[-1], count)
 

@@ -114,10 +114,10 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, 
 
 
 def print_facts(rows: Sequence[tuple[str, str]]) -> None:
-    """Print names and values, one pair a line; long values wrap."""
+    """Print names and values, one pair a line, ``-`` for an empty value; long values wrap."""
     width = max(len(name) for name, _ in rows)
     for name, value in rows:
-        print(wrapped(value, f"{GAP}{name:{width}}{GAP}", " " * (width + 2 * len(GAP))))
+        print(wrapped(value or "-", f"{GAP}{name:{width}}{GAP}", " " * (width + 2 * len(GAP))))
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], legend: str = "") -> None:

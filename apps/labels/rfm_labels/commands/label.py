@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias, get_args
 
@@ -15,7 +16,7 @@ import typer
 from rfm_client import RewardError
 from rfm_client.command_line import ExitCode, JsonOutput, ServerOptions, print_facts, print_table, report, with_options
 from rfm_client.frames import ChannelOrder, Orientation
-from rfm_client.options import ConfigError, Settings, counted, setting
+from rfm_client.options import ConfigError, Settings, counted, first_names, setting
 from rfm_labels.audit import audit
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, SeveralTasks, parsed_by_camera
 from rfm_labels.datasets.faults import FaultsError, UnusedTaskError, listed, require
@@ -27,7 +28,7 @@ from rfm_labels.label_files import LabelFile, find_label_files, read_blank, rewa
 from rfm_labels.labelling import Outputs, Report, planned
 from rfm_labels.labelling import label as label_dataset
 from rfm_labels.metadata import blank_lines
-from rfm_labels.options import LabelOptions, RayOptions, Watch
+from rfm_labels.options import DEFAULTS, LabelOptions, RayOptions, Watch, check_name
 from rfm_labels.plan import checked_episodes
 from rfm_labels.ray_engine import Connect, label_with_ray
 from rfm_labels.scorer import ClientScorer, Scorer
@@ -220,6 +221,7 @@ class RunOptions(JsonOutput):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_name("remove", self.remove)
         chosen = [name for name in ("dry_run", "report", "list_labels", "remove") if getattr(self, name)]
         if len(chosen) > 1:
             raise ConfigError.of_two(chosen[0], "excludes", chosen[1])
@@ -285,7 +287,8 @@ class LabelCommand:
     @property
     def _instead(self) -> dict[str, Callable[[], None]]:
         """What to do instead of labelling, by option."""
-        return {"report": self._report, "dry_run": self._try, "list_labels": self._list, "remove": self._remove}
+        remove = partial(self._remove, [self])
+        return {"report": self._report, "dry_run": self._try, "list_labels": self._list, "remove": remove}
 
     def _run_each(self, files: Sequence[Path]) -> ExitCode:
         """Run for each HDF5 file in a folder, once all can be opened. Raises DatasetError if one cannot."""
@@ -298,8 +301,11 @@ class LabelCommand:
         has_room = self.labels.output is None or not twice
         require("output", has_room, "a folder for files whose names differ", got)
         commands = [replace(self, source=str(file)) for file in files]
+        if self.options.remove:
+            self._remove(commands)
+            return ExitCode.OK
         codes = []
-        reads_frames = not (self.options.report or self.options.list_labels or self.options.remove)
+        reads_frames = not (self.options.report or self.options.list_labels)
         for command in self._checked(commands) if reads_frames else commands:
             self.say(f"{command.source}")
             codes.append(command.run())
@@ -400,39 +406,51 @@ class LabelCommand:
         print_facts(summary.rows())
 
     def _outputs(self, labels: LabelOptions) -> Outputs:
-        """Where the label files are, as far as is known without opening the dataset."""
+        """Where the label files are, without opening the dataset. Raises DatasetError for one that is not local."""
         path = Path(self.source)
+        remedy = "none: name the folder of its labels with --output"
+        require(self.source, path.exists() or labels.output is not None, "a local dataset", remedy)
         return Outputs(labels.output or (path if path.is_dir() else path.parent), labels, label_prefix(path))
 
     def _list(self) -> None:
         """List the labels that are there."""
-        outputs = self._outputs(self.labels)
-        files = [LabelFile.read(file) for file in find_label_files(Path(self.source), outputs.folder)]
-        require(outputs.folder, bool(files), "label files", "none: label the dataset first, or name its --output")
-        rows = [
-            (reward_name(each.path).removeprefix(outputs.prefix), each.checkpoint or "-", str(len(each.digests) or "-"))
-            for each in files
-        ]
-        print_table("", ("labels", "checkpoint", "episodes"), rows)
+        outputs, rows, named = self._outputs(self.labels), [], dict[object, str]()
+        for each in map(LabelFile.read, find_label_files(Path(self.source), outputs.folder)):
+            name = reward_name(each.path).removeprefix(outputs.prefix)
+            first = named.setdefault(tuple(each.digests.items()) or name, name)
+            same = "-" if first == name else first  # as an alias is
+            rows.append((name, each.checkpoint or "-", str(len(each.digests) or "-"), same))
+        if rows:
+            print_table("", ("labels", "checkpoint", "episodes", "equals"), rows)
+        else:
+            self.say(f"{self.source}: no labels in {outputs.folder}: label it first, or name their --output")
 
-    def _remove(self) -> None:
-        """Delete the label files of a name. Raises DatasetError, or typer.Abort after a "no"."""
-        outputs = self._outputs(replace(self.labels, name=self.options.remove or ""))
-        files = outputs.before()
-        require(outputs.folder, bool(files), f"label files {self.options.remove}", "none; --list shows the others")
-        for file in files:
+    def _remove(self, commands: Sequence[LabelCommand]) -> None:
+        """Delete the label files of a name of these datasets. Raises DatasetError, or typer.Abort after a "no"."""
+        for option in ("name", "episodes", "filter_key", "limit", "shard"):
+            if getattr(self.labels, option) != getattr(DEFAULTS, option):
+                raise ConfigError.of_two("remove", "excludes", option)
+        labels = replace(self.labels, name=self.options.remove or "")
+        places = [command._outputs(labels) for command in commands]
+        files = [(place, file) for place in places for file in place.before()]
+        require(places[0].folder, bool(files), f"label files {labels.name}", "none; --list shows the others")
+        for _, file in files:
             require(file.path, bool(file.provenance), "labels of rfm-client", "others: delete the file yourself")
-        what = counted(max(len(file.digests) for file in files), "episode")
-        where = outputs.options.parts or outputs.own_parts
-        is_kept = all(map(outputs.keeps, files))
-        if not (is_kept or self.options.yes):
-            labels = f"labels of {what}, which are not all in {where}"
-            _confirm(f"Delete {labels}?", "--yes for labels that must be scored again", f"none for {labels}")
-        remove_files([file.path for file in files])
-        for file in files:
-            typer.echo(f"deleted {file.path}, labels of {what} by {file.checkpoint}")
-        if is_kept:
-            self.say(f"the same command without --remove writes them again from {where}, which you may delete, too")
+        where = ", ".join(dict.fromkeys(str(labels.parts or place.own_parts) for place, _ in files))
+        lost = [file.path for place, file in files if not place.keeps(file)]
+        if lost and not self.options.yes:
+            got = f"{first_names(lost)}, whose episodes are not all in {where}"
+            _confirm(f"Delete {got}?", "--yes for labels that must be scored again", f"none for {got}")
+        remove_files([file.path for _, file in files])
+        for _, file in files:
+            typer.echo(f"deleted {file.path}, labels of {counted(len(file.digests), 'episode')} by {file.checkpoint}")
+        gone = [file.digests for _, file in files if file.digests]
+        folders = dict.fromkeys(place.folder for place, _ in files)
+        for path in (path for folder in folders for path in sorted(folder.glob("[!.]*.parquet"))):
+            if LabelFile.read(path).digests in gone:
+                self.say(f"note: {path} has the same labels and stays; delete it, too, if it is an alias")
+        if not lost:
+            self.say(f"the command that made them writes them again from {where}")
 
     def _dataset(self) -> Dataset:
         return open_dataset(self.source, **self.texts.opening)

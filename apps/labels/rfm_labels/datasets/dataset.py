@@ -306,7 +306,7 @@ class Dataset(ABC):
 
     @property
     def listing(self) -> Sequence[DatasetEpisode]:
-        """``episodes``; of a dataset on the Hub as its metadata list them, so that no row table is downloaded."""
+        """Like ``episodes``, but a Hub dataset takes them from its metadata and downloads no row table."""
         return self.episodes
 
     def times_s(self, episode: DatasetEpisode) -> Times | None:
