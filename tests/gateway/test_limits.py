@@ -152,8 +152,8 @@ def test_bodies_share_the_memory_of_eight_of_the_largest() -> None:
 
 @pytest.mark.parametrize("is_announced", [True, False], ids=["announced", "chunked"])
 def test_arrays_are_views_of_the_form_that_they_come_in(*, is_announced: bool) -> None:
-    arrays = [np.arange(number, dtype=np.float64) for number in (1, 3, 20_000)]
-    files = [("a" * number, ("a.npy", npy(array))) for number, array in enumerate(arrays, 1)]  # at odd offsets
+    arrays: list[Any] = [np.arange(3, dtype=np.uint8), *(np.arange(number, dtype=np.float64) for number in (1, 20_000))]
+    files = [(f"{number}", ("a.npy", npy(array))) for number, array in enumerate(arrays)]  # odd sizes first
     body: Any = requests.Request("POST", "http://x", files=files).prepare().body
     form = Form(len(body) if is_announced else 0)
     parser = form.parser(body[2:].partition(b"\r\n")[0])
