@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,7 +34,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract.triton import LOST_REGION
-from rfm_client.transport import shared_memory
+from rfm_client.transport import limits, shared_memory
 from rfm_client.transport.shared_memory import MIN_SHARED_BYTES, SharedMemory
 from servers import PATIENCE_S, Endpoints, Served, start_triton
 from trajectories import random_trajectory
@@ -180,6 +183,9 @@ def test_closing_a_client_of_a_hanging_server_frees_its_shared_memory(demo_serve
             assert ours_in_dev_shm() == before
 
 
+LARGE = np.zeros(MIN_SHARED_BYTES, np.uint8)
+
+
 class RestartedServer:
     """Stands for tritonclient's client. mapped: names of the server's regions"""
 
@@ -195,10 +201,9 @@ class RestartedServer:
 
 def test_a_late_word_of_a_restart_keeps_the_memory_mapped_since() -> None:
     server, memory = RestartedServer(), SharedMemory("grpc://127.0.0.1:1")
-    large = np.zeros(MIN_SHARED_BYTES, np.uint8)
 
     async def call() -> str:
-        async with memory.lend(server, large) as region:
+        async with memory.lend(server, LARGE) as region:
             assert region is not None
             await asyncio.sleep(0)
             if region.name not in server.mapped:
@@ -206,7 +211,7 @@ def test_a_late_word_of_a_restart_keeps_the_memory_mapped_since() -> None:
             return region.name
 
     async def late(known: asyncio.Event) -> None:
-        async with memory.lend(server, large):
+        async with memory.lend(server, LARGE):
             await known.wait()
             raise InferenceServerException(LOST_REGION)
 
@@ -229,17 +234,88 @@ def test_a_late_word_of_a_restart_keeps_the_memory_mapped_since() -> None:
 
 
 @pytest.mark.usefixtures("nothing_shared_is_left")
-def test_a_restarted_server_gets_the_inputs_in_the_same_call(demo_server: Endpoints) -> None:
+def test_a_restarted_server_gets_the_inputs_in_the_same_call(
+    demo_server: Endpoints, monkeypatch: pytest.MonkeyPatch
+) -> None:
     sample = ProgressSample(heavy(), frame_steps=2)
     with RewardClient(demo_server.grpc_url, shared_memory=True, retry=False) as client:
         before, expected = regions(demo_server), client.evaluate([sample])
         (mapped,) = regions(demo_server) - before
         with tritonclient.grpc.InferenceServerClient(demo_server.grpc_url.removeprefix("grpc://")) as triton:
             triton.unregister_system_shared_memory(mapped)  # as a restart does
+        monkeypatch.setattr(limits, "MAX_REQUEST_BYTES", MIN_SHARED_BYTES)  # no room for it outside shared memory
         for _ in range(2):
             assert_same(client.evaluate([sample])[0], expected[0])
         assert mapped not in regions(demo_server)
         assert len(regions(demo_server) - before) == 1
+
+
+def test_a_restart_after_a_request_that_failed_keeps_sharing_and_unmaps_what_is_lost(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    server, memory = RestartedServer(), SharedMemory("grpc://127.0.0.1:1")
+
+    async def ask() -> None:
+        for reason in ("an invalid sample", LOST_REGION):
+            with pytest.raises(InferenceServerException, match=reason):
+                async with memory.lend(server, LARGE):
+                    raise InferenceServerException(reason)
+        async with memory.lend(server, LARGE) as region:
+            assert region is not None
+            assert server.mapped == {region.name}
+        await memory.close(server)
+
+    asyncio.run(ask())
+    assert not caplog.records
+
+
+def test_a_full_dev_shm_is_tried_again(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    server, memory = RestartedServer(), SharedMemory("grpc://127.0.0.1:1")
+    full = SimpleNamespace(f_bavail=0, f_frsize=1, f_blocks=1)
+
+    async def ask() -> None:
+        with monkeypatch.context() as patched:
+            patched.setattr(os, "statvfs", lambda _: full)
+            for _ in range(2):
+                async with memory.lend(server, LARGE) as region:
+                    assert region is None
+        async with memory.lend(server, LARGE) as region:
+            assert region is not None
+        await memory.close(server)
+
+    asyncio.run(ask())
+    (told,) = (record.message for record in caplog.records)
+    assert told.endswith("less than half of /dev/shm would stay free")
+
+
+def test_a_region_is_made_beside_the_event_loop_and_a_cancelled_one_leaves_no_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    begun, may_end, before = threading.Event(), threading.Event(), ours_in_dev_shm()
+    reserve = os.posix_fallocate
+
+    def slow(*arguments: int) -> None:
+        begun.set()
+        assert may_end.wait(PATIENCE_S)
+        reserve(*arguments)
+
+    monkeypatch.setattr(os, "posix_fallocate", slow)
+    memory = SharedMemory("grpc://127.0.0.1:1")
+
+    async def lend() -> None:
+        async with memory.lend(RestartedServer(), LARGE):
+            raise AssertionError("expected no region")
+
+    async def ask() -> None:
+        lending = asyncio.create_task(lend())
+        await asyncio.to_thread(begun.wait, PATIENCE_S)
+        lending.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await lending
+        may_end.set()
+
+    asyncio.run(ask())
+    assert ours_in_dev_shm() == before
 
 
 def test_behind_a_load_balancer_no_region_is_shared_after_the_first(caplog: pytest.LogCaptureFixture) -> None:
@@ -247,9 +323,9 @@ def test_behind_a_load_balancer_no_region_is_shared_after_the_first(caplog: pyte
 
     async def ask() -> None:
         with pytest.raises(InferenceServerException):
-            async with memory.lend(mapping, np.zeros(MIN_SHARED_BYTES, np.uint8)):
+            async with memory.lend(mapping, LARGE):
                 raise InferenceServerException(LOST_REGION)  # from another server
-        async with memory.lend(mapping, np.zeros(MIN_SHARED_BYTES, np.uint8)) as region:
+        async with memory.lend(mapping, LARGE) as region:
             assert region is None
         await memory.close(mapping)
 

@@ -75,6 +75,10 @@ def test_the_key_is_that_of_the_file_or_else_of_the_variable(tmp_path: Path) -> 
     (tmp_path / "key.txt").write_text(f"{KEY}\n")
     environment = {"RFM_GATEWAY_API_KEY": "another"}
     assert GatewayConfig(api_key_file=tmp_path / "key.txt").api_key(environment) == KEY
+    config = GatewayConfig(triton_api_key_file=tmp_path / "key.txt")
+    kept = config.credentials
+    (tmp_path / "key.txt").unlink()  # requests read no file
+    assert config.credentials is kept
     assert GatewayConfig().api_key(environment) == "another"
     assert GatewayConfig().api_key({}) is None
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 import requests
 
@@ -27,13 +28,18 @@ from gateway_requests import (
     begun,
     dumped,
     failure,
+    npy,
     post_body,
     progress,
 )
 from gateways import Address, StandIn, inside, listening
+from rfm_gateway.body import _read_npy
+from rfm_gateway.config import MIB
+from rfm_gateway.form import Form
 from servers import wait_for
 
 KEY = "open sesame"
+NOTHING: Any = {}  # no sample
 SCORED = {"outputs_progress": {"progress_pred": [[pytest.approx(0.1)] * 3]}}  # of FIRST, by the stand-in
 
 
@@ -130,6 +136,34 @@ def test_more_callers_than_are_scored_at_a_time_are_all_answered() -> None:
             assert response.status == 200
             assert json.loads(response.read()).items() >= SCORED.items()
             caller.close()
+
+
+def test_bodies_share_the_memory_of_eight_of_the_largest() -> None:
+    with listening(StandIn(served=["rfm"]), max_body_mib=1) as gateway:
+        slow = [begun(gateway, {"Content-Length": f"{MIB}"}, b" " * (MIB - 1)) for _ in range(8)]
+        wait_for(lambda: ask_json(gateway, [NOTHING]).status_code == 503)
+        response = ask_json(gateway, [NOTHING])
+        assert failure(response, 503) == "body: expected at most 8 MiB of bodies at a time, got more; try again"
+        assert response.headers["Retry-After"] == "1"
+        for caller in slow:
+            caller.close()
+        wait_for(lambda: ask_json(gateway, [NOTHING]).status_code == 422)
+
+
+@pytest.mark.parametrize("is_announced", [True, False], ids=["announced", "chunked"])
+def test_arrays_are_views_of_the_form_that_they_come_in(*, is_announced: bool) -> None:
+    arrays: list[Any] = [np.arange(3, dtype=np.uint8), *(np.arange(number, dtype=np.float64) for number in (1, 20_000))]
+    files = [(f"{number}", ("a.npy", npy(array))) for number, array in enumerate(arrays)]  # odd sizes first
+    body: Any = requests.Request("POST", "http://x", files=files).prepare().body
+    form = Form(len(body) if is_announced else 0)
+    parser = form.parser(body[2:].partition(b"\r\n")[0])
+    for start in range(0, len(body), 1000):
+        parser.write(body[start : start + 1000])
+    _, uploads = form.parts()
+    for upload, array in zip(uploads.values(), arrays, strict=True):
+        read = _read_npy(upload.content)
+        np.testing.assert_array_equal(read, array)
+        assert np.shares_memory(read, upload.content)
 
 
 POST = b"POST /evaluate_batch HTTP/1.1\r\nHost: localhost\r\n"

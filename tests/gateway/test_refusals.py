@@ -111,6 +111,7 @@ def test_a_body_whose_samples_cannot_be_read(
     check_refused(gateway.post(NPY if "files" in sent else "/evaluate_batch", **sent), (path, message))
 
 
+ENDLESS = b"--b\r\nContent-Disposition: "
 NAMELESS = b"--b\r\nContent-Disposition: form-data\r\n\r\nx\r\n--b--\r\n"
 NO_FORM = "content-type: expected multipart/form-data with a boundary, got"
 NO_PARTS, NO_END = "body: expected multipart/form-data, got: ", "body: expected its last boundary"
@@ -121,6 +122,8 @@ UNREADABLE: dict[str, tuple[int, str, str, bytes]] = {
     "no boundary": (415, f"{NO_FORM} multipart/form-data", "multipart/form-data", NAMED),
     "no multipart": (400, NO_PARTS, MULTIPART, b"hello"),
     "no name": (400, NO_PARTS, MULTIPART, NAMELESS),
+    "an endless header": (400, NO_PARTS, MULTIPART, ENDLESS + b"a" * 2**14),
+    "endless headers": (400, NO_PARTS, MULTIPART, ENDLESS + b"\r\na: b" * 2**12),
     **{
         f"charset {name}": (
             415,

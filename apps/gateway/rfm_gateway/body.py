@@ -64,7 +64,8 @@ class Batch:
 class BodyLimits:
     """Limits on a request body: size, at most MAX_JSON_BYTES for JSON, and time to arrive.
 
-    Reading raises HTTPException 413 as soon as the announced or received size is too large, and TimeoutError.
+    Reading raises HTTPException 413 as soon as the announced or received size is too large, 503 if all bodies together
+    are, and TimeoutError.
     """
 
     max_bytes: int
@@ -111,7 +112,7 @@ class BodyLimits:
         if charset.lower() not in _CHARSETS:  # some of Python's codecs fail, others change the text
             raise HTTPException(415, f"content-type: expected the charset utf-8, got {reprlib.repr(charset)}")
         announced = request.headers.get("content-length", "")
-        form = Form(int(announced) if announced.isdecimal() else 0)
+        form = Form(min(int(announced), self.max_bytes) if announced.isdecimal() else 0)
         try:
             parser = form.parser(options[b"boundary"])
             with anyio.fail_after(self.timeout_s):
@@ -134,6 +135,7 @@ class BodyLimits:
             num_bytes += len(chunk)
             if num_bytes > max_bytes:
                 raise too_large
+            request.state.hold(len(chunk))
             yield chunk
 
 

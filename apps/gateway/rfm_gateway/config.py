@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -90,7 +91,7 @@ class GatewayConfig(Settings):
             raise ConfigError.at("triton", "the URL of a Triton", "none")
         return self.triton
 
-    @property
+    @cached_property
     def credentials(self) -> Credentials:
         """Credentials for Triton. Raises ConfigError for unusable files."""
         key = self._key_in("triton_api_key_file")

@@ -20,7 +20,7 @@ from rfm_gateway.field_errors import invalid
 MAX_PARTS = 2000  # even an empty part takes memory
 MAX_JSON_BYTES = 32 * 2**20  # large arrays come as files
 AS_FILES = "send arrays as .npy files, to /evaluate_batch_npy"
-_MAX_RESERVED_BYTES = 32 * 2**20  # for a body that is announced; more as it arrives
+_ALIGNED_BYTES = 16  # as numpy aligns arrays; less than the head of a part takes
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,14 +34,14 @@ class Upload:
 class Form:
     """The fields and files in a multipart body, all in one buffer: reading a file need not copy it.
 
-    announced_bytes: size of the body; 0: unknown
+    announced_bytes: size of the body; 0: unknown. No memory is taken before it arrives.
 
     The methods ``on_...`` are python_multipart's callbacks. They raise ValueError for a malformed body, HTTPException
     413 for too many parts and for fields above MAX_JSON_BYTES.
     """
 
     def __init__(self, announced_bytes: int) -> None:
-        self._buffer = np.empty(min(announced_bytes, _MAX_RESERVED_BYTES), np.uint8)
+        self._buffer = np.empty(announced_bytes, np.uint8)
         self._begin = self._end = 0  # of the last part's content, in the buffer
         self._parts: list[tuple[str, str | None, slice]] = []  # name, name of the file, content
         self._num_field_bytes = 0
@@ -97,7 +97,7 @@ class Form:
             raise ValueError("a part without a name in its Content-Disposition")
         file = options.get(b"filename")
         self._name, self._file = _text(options[b"name"]), None if file is None else _text(file)
-        self._begin = self._end
+        self._begin = self._end = -(-self._end // _ALIGNED_BYTES) * _ALIGNED_BYTES  # or numpy would copy the array
 
     def on_part_data(self, data: bytes, start: int, end: int) -> None:
         """Take a piece of the part's content."""
@@ -107,7 +107,9 @@ class Form:
             if self._num_field_bytes > MAX_JSON_BYTES:
                 raise HTTPException(413, f"body: expected at most {MAX_JSON_BYTES} bytes of JSON, got more; {AS_FILES}")
         if self._end > len(self._buffer):
-            self._buffer = np.concatenate([self._buffer, np.empty(self._end, np.uint8)])
+            grown = np.empty(2 * self._end, np.uint8)
+            grown[:begin] = self._buffer[:begin]
+            self._buffer = grown
         self._buffer[begin : self._end] = np.frombuffer(data, np.uint8, end - start, start)
 
     def on_part_end(self) -> None:

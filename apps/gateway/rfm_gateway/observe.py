@@ -16,7 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rfm_client import DeadlineExceededError
 from rfm_client.serving import begin_request
-from rfm_gateway.config import GatewayConfig
+from rfm_gateway.config import MIB, GatewayConfig
 
 Returned = TypeVar("Returned")
 
@@ -34,6 +34,7 @@ CALLER_LEFT = 499  # as nginx logs it
 
 REQUEST_ID_HEADER = "X-Request-ID"
 RETRY_AFTER = {"Retry-After": "1"}
+LARGEST_BODIES = 8  # so many of the largest size may be in memory
 
 _BUCKETS_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0)
 
@@ -68,30 +69,47 @@ class GatewayMetrics:
 
 
 class Places:
-    """Places for evaluations: ``max_in_flight`` at a time; ``max_waiting`` more wait, first come, first served."""
+    """Places for evaluations: ``max_in_flight`` at a time; ``max_waiting`` more wait, first come, first served.
+
+    Their bodies share the memory that LARGEST_BODIES of ``max_body_mib`` take.
+    """
 
     def __init__(self, config: GatewayConfig, metrics: GatewayMetrics) -> None:
         self._config = config
         self._places = anyio.CapacityLimiter(config.max_in_flight)
+        self._free_bytes = LARGEST_BODIES * config.max_body_mib * MIB
         metrics.in_flight.set_function(lambda: self._places.borrowed_tokens)
         metrics.waiting.set_function(lambda: self._places.statistics().tasks_waiting)
 
-    async def taken(self) -> AsyncGenerator[None, None]:
+    async def taken(self, request: Request) -> AsyncGenerator[None, None]:
         """Endpoint dependency: take a place before the body is read, and give it back after the response.
 
-        Raises HTTPException 503 if too many wait, or no place is free within ``timeout_s``.
+        ``request.state.hold(num_bytes)`` then takes memory for a piece of the body.
+
+        Both raise HTTPException 503: if too many wait, no place is free within ``timeout_s``, or the memory is taken.
         """
         detail = f"expected at most {self._config.max_in_flight} evaluations at a time, got more"
-        full, places, request = HTTPException(503, detail, RETRY_AFTER), self._places, object()
+        full, places, held_bytes = HTTPException(503, detail, RETRY_AFTER), self._places, 0
+
+        def hold(num_bytes: int) -> None:
+            nonlocal held_bytes
+            if num_bytes > self._free_bytes:
+                most = f"{LARGEST_BODIES * self._config.max_body_mib} MiB of bodies at a time"
+                raise HTTPException(503, f"body: expected at most {most}, got more; try again", RETRY_AFTER)
+            held_bytes += num_bytes
+            self._free_bytes -= num_bytes
+
         if places.available_tokens < 1 and places.statistics().tasks_waiting >= self._config.max_waiting:
             raise full
         with anyio.move_on_after(self._config.timeout_s) as waiting:
             await places.acquire_on_behalf_of(request)
         if waiting.cancelled_caught:
             raise full
+        request.state.hold = hold
         try:
             yield
         finally:
+            self._free_bytes += held_bytes
             places.release_on_behalf_of(request)
 
 

@@ -103,12 +103,13 @@ class TritonTransport:
                 return answer
 
         async def request(client: Any) -> Answer:
-            try:
-                arrays, version = await ask(client, self._shared_memory)
-            except InferenceServerException as error:
-                if triton.LOST_REGION not in (error.message() or ""):
-                    raise
-                arrays, version = await ask(client, None)
+            for memory in (self._shared_memory, self._shared_memory, None):  # a restarted server maps a new region
+                try:
+                    arrays, version = await ask(client, memory)
+                    break
+                except InferenceServerException as error:
+                    if memory is None or triton.LOST_REGION not in (error.message() or ""):
+                        raise
             absent = [name for name in outputs if name not in arrays]
             if absent:
                 raise errors.InferenceFailedError(f"outputs: expected {', '.join(outputs)}, got no {', '.join(absent)}")

@@ -44,26 +44,24 @@ logger = logging.getLogger("rfm_client")
 
 
 class Region:
-    """Memory that the server also maps. Raises OSError unless half of /dev/shm stays free, which the server needs.
+    """Memory that the server also maps, after ``reserve``. Raises OSError for a name that cannot be made.
 
     generation: how many server restarts were noticed before
     """
 
     def __init__(self, name: str, byte_size: int, generation: int) -> None:
         self.name, self.byte_size, self.generation = name, byte_size, generation
-        self.was_read = False  # by the server
+        self.was_used = False  # by a request, even one that failed
+        (FOLDER / name).touch(0o600, exist_ok=False)
+
+    def reserve(self) -> None:
+        """Take the memory, which blocks. Raises OSError unless half of /dev/shm stays free, which the server needs."""
         room = os.statvfs(FOLDER)
-        if room.f_bavail * room.f_frsize - byte_size < room.f_blocks * room.f_frsize / 2:
+        if room.f_bavail * room.f_frsize - self.byte_size < room.f_blocks * room.f_frsize / 2:
             raise OSError(errno.ENOSPC, f"less than half of {FOLDER} would stay free")
-        descriptor = os.open(FOLDER / name, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_CLOEXEC, 0o600)
-        try:
-            os.posix_fallocate(descriptor, 0, byte_size)  # raises OSError now, where a write would raise SIGBUS later
-            self._memory = mmap.mmap(descriptor, byte_size)
-        except OSError:
-            self.unlink()
-            raise
-        finally:
-            os.close(descriptor)
+        with (FOLDER / self.name).open("r+b") as file:
+            os.posix_fallocate(file.fileno(), 0, self.byte_size)  # fails now, where a write would raise SIGBUS later
+            self._memory = mmap.mmap(file.fileno(), self.byte_size)
 
     def write(self, array: npt.NDArray[Any]) -> None:
         """Copy ``array`` to the region's start."""
@@ -84,8 +82,10 @@ class SharedMemory:
         self._url = url
         self._names = (f"rfm-client-{uuid.uuid4().hex}-{number}" for number in itertools.count())
         self._is_usable = True
+        self._has_warned = False
         self._generation = 0
         self._free: list[Region] = []
+        self._reserving = asyncio.Lock()  # or each of several would find the same room
         self._registered: set[str] = set()  # names that the server may map
 
     @asynccontextmanager
@@ -99,20 +99,19 @@ class SharedMemory:
         try:
             await asyncio.shield(writing)
             yield region
-            region.was_read = True
         except InferenceServerException as error:
             if triton.LOST_REGION in (error.message() or "") and region.generation == self._generation:
                 self._generation += 1  # the server was restarted, and knows no region
-                self._free.clear()
-                if not region.was_read:
+                if not region.was_used:
                     self._give_up("several servers share this address: one has mapped a region, another was asked")
             raise
         finally:
+            region.was_used = True
             # After a cancelled call the server may still read the region, but its answer is dropped.
             if writing.done():
-                self._give_back(region)
+                self._free.append(region)
             else:  # a thread still writes
-                writing.add_done_callback(lambda _: self._give_back(region))
+                writing.add_done_callback(lambda _: self._free.append(region))
 
     async def close(self, client: Any) -> None:
         """Make the server unmap all regions. A region that a request still uses after CLOSE_TIMEOUT_S stays mapped."""
@@ -125,6 +124,10 @@ class SharedMemory:
                         await asyncio.sleep(IN_USE_PAUSE_S)
 
     async def _take(self, client: Any, byte_size: int) -> Region | None:
+        lost = [region for region in self._free if region.generation != self._generation]
+        self._free = [region for region in self._free if region.generation == self._generation]
+        for region in lost:  # another server at this address may still map it
+            await self._unregister(client, region.name)
         fitting = [region for region in self._free if region.byte_size >= byte_size]
         if fitting:
             region = min(fitting, key=lambda region: region.byte_size)
@@ -135,14 +138,13 @@ class SharedMemory:
         if self._free:  # all too small: replace a region, so that regions never outnumber concurrent requests
             await self._unregister(client, self._free.pop().name)
         try:
-            size = max(MIN_REGION_BYTES, 1 << (byte_size - 1).bit_length())
-            region = Region(next(self._names), size, self._generation)
+            region = await self._made(max(MIN_REGION_BYTES, 1 << (byte_size - 1).bit_length()))
         except OSError as error:
-            self._give_up(str(error))
+            self._give_up(str(error), for_good=error.errno != errno.ENOSPC)
             return None
         self._registered.add(region.name)  # now, because a cancelled call may still map it
         try:
-            await client.register_system_shared_memory(region.name, f"/{region.name}", size)
+            await client.register_system_shared_memory(region.name, f"/{region.name}", region.byte_size)
         except InferenceServerException as error:
             reason, status = error.message() or "no reason given", str(error.status())
             if status in (*triton.UNAVAILABLE, *triton.OUT_OF_TIME) and triton.RESTRICTED not in reason:
@@ -157,15 +159,22 @@ class SharedMemory:
             region.unlink()
         return region
 
-    def _give_up(self, reason: str) -> None:
-        """Make no more regions."""
-        if self._is_usable:
-            self._is_usable = False
-            logger.warning("%s: no shared memory, inputs go through the socket: %s", self._url, reason)
+    async def _made(self, byte_size: int) -> Region:
+        region = Region(next(self._names), byte_size, self._generation)
+        try:
+            async with self._reserving:
+                await off_loop(byte_size, region.reserve)
+        except BaseException:  # also if cancelled: without the name the thread's work comes to nothing
+            region.unlink()
+            raise
+        return region
 
-    def _give_back(self, region: Region) -> None:
-        if region.generation == self._generation:
-            self._free.append(region)
+    def _give_up(self, reason: str, *, for_good: bool = True) -> None:
+        """Make no more regions, or none for this input; log the first reason."""
+        self._is_usable = self._is_usable and not for_good
+        if not self._has_warned:
+            self._has_warned = True
+            logger.warning("%s: no shared memory, inputs go through the socket: %s", self._url, reason)
 
     async def _unregister(self, client: Any, name: str) -> None:
         """Make the server unmap a region. While a request uses it, it stays in ``_registered``."""
