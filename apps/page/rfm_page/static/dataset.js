@@ -490,6 +490,7 @@ export class DatasetTab {
     if (signal.aborted) return;
     place.show(downloading(episode, size));
     await missingOf(this.#number, episode, signal, true);
+    this.#table.refill(episode);
     if (!signal.aborted) place.clear();
   }
 
