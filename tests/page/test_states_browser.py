@@ -10,14 +10,13 @@ from pathlib import Path
 import pytest
 from selenium.webdriver.support.select import Select
 
-import clip
 import local_hub
 from browsers import Browser
 from gateways import StandIn, free_port, listening, running
 from labelling import LEROBOT, BrightnessScorer
 from paths import ROOT
 from rfm_labels import LabelOptions, label, open_dataset
-from servers import Endpoints, start_triton, wait_for
+from servers import Endpoints, start_triton
 from shown_datasets import copied, hdf5, large
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
@@ -165,23 +164,3 @@ def test_an_episode_on_the_hub_opens_once_it_is_downloaded_and_a_large_download_
         browser.until("document.querySelectorAll('#episode-videos video').length === 2")
         assert browser["episode-errors"].text == ""
         browser.until(f"{pictures} === 2")
-
-
-def test_a_comparison_that_takes_long_can_be_stopped(browser: Browser, tmp_path: Path) -> None:
-    """The stand-in for Triton does not answer."""
-    files = [tmp_path / f"{number}.mp4" for number in range(2)]
-    for number, file in enumerate(files):
-        clip.write(file, clip.render()[number:])
-    triton = StandIn()
-    with listening(triton) as gateway:
-        browser.open(gateway.url)
-        browser.drop(files)
-        browser.write("tasks", clip.TASK)
-        browser["compare"].click()
-        browser.until_text("status", "Comparing 2 videos.")
-        assert (browser["compare"].is_displayed(), browser["stop"].is_displayed()) == (False, True)
-        browser["stop"].click()
-        browser.until("document.getElementById('stop').disabled")
-        assert (browser["compare"].is_displayed(), browser["stop"].is_displayed()) == (True, False)
-        assert (browser["status"].text, browser["errors"].text) == ("", "")
-        wait_for(lambda: triton.num_cancelled > 0)

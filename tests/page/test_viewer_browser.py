@@ -406,7 +406,7 @@ def test_tasks_are_overlaid_colours_tell_videos_apart_and_lines_tell_tasks_apart
     assert [video["source"] for video in page.saved()["videos"]] == ["success.mp4", "failure.mp4"]  # the files' names
 
 
-def test_a_slow_upload_shows_its_percentage_and_then_the_curve(page: Page) -> None:
+def test_a_slow_upload_shows_its_percentage_and_then_the_curve_and_a_slow_comparison_can_be_stopped(page: Page) -> None:
     link = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": 20_000}  # bytes a second
     page.browser.driver.execute_cdp_cmd("Network.enable", {})
     page.browser.driver.execute_cdp_cmd("Network.emulateNetworkConditions", link)
@@ -415,6 +415,15 @@ def test_a_slow_upload_shows_its_percentage_and_then_the_curve(page: Page) -> No
         page.browser.until("/, uploading [1-9]\\d? %$/.test(document.getElementById('scored').textContent)")
         assert page.browser.cells("#curves tr")[0][-1].startswith("uploading, ")
         page.browser.until_text("scored", "1 of 1 scored")
+        page.drop("success")
+        page.browser.until_text("scored", "2 of 2 scored")
+        page.browser["compare"].click()
+        page.browser.until_text("status", "Comparing 2 videos.")
+        assert (page.browser["compare"].is_displayed(), page.browser["stop"].is_displayed()) == (False, True)
+        page.browser["stop"].click()
+        page.browser.until("document.getElementById('stop').disabled")
+        assert (page.browser["compare"].is_displayed(), page.browser["stop"].is_displayed()) == (True, False)
+        assert [page.browser[name].text for name in ("status", "errors")] == ["", ""]
     finally:
         page.browser.driver.execute_cdp_cmd("Network.emulateNetworkConditions", link | {"uploadThroughput": -1})
 
