@@ -17,7 +17,7 @@ import typer
 from rfm.serve.triton_server import stopped_by_signals, temporary_server
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, SimilaritySample, Trajectory
 from rfm_client.cli.pictures import Panel, plot
-from rfm_client.cli.scoring import checkpoint_of, heading
+from rfm_client.cli.scoring import heading
 from rfm_client.cli.show import PAGE_PORT, PAGE_URL, command, next_steps, score_step, scores_table
 from rfm_client.contract.wire import DEFAULT_MODEL
 from rfm_client.frames.inputs import load_trajectory
@@ -93,7 +93,7 @@ def show_clips(url: str, trajectories: Sequence[Trajectory], picture: Path) -> N
     }
     with RewardClient(url) as client:
         results = client.evaluate(list(samples.values()))
-        checkpoint = checkpoint_of(client, success)
+        info = client.model_info(frames=True)
     answers = dict(zip(samples, results, strict=True))
     print(scores_table(f'"{success.task}"', list(answers.items())))
     panels = [
@@ -103,7 +103,7 @@ def show_clips(url: str, trajectories: Sequence[Trajectory], picture: Path) -> N
     ]
     preference, same, different = results[-3:]
     title = (
-        f"{heading(success.task, [checkpoint])}\nP(success preferred to failure) = {preference.preference:.3f}; "
+        f"{heading(success.task, [info])}\nP(success preferred to failure) = {preference.preference:.3f}; "
         f"similarity of two successes {same.similarity:.1f}, of success and another task {different.similarity:.1f}"
     )
     plot(picture, panels, title, columns=2)

@@ -16,7 +16,6 @@ from rfm_client import RewardClient, Trajectory
 from rfm_client.cli.command import OptionValues, with_options
 from rfm_client.cli.options import FrameRate
 from rfm_client.cli.show import PAGE_PORT, PAGE_URL, command, next_steps, scores_table
-from rfm_client.contract.description import TOY
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.contract.wire import frames_name
 from rfm_commands.command import TritonPath, fail
@@ -78,19 +77,19 @@ def score_video(endpoints: Endpoints, video: Path, frames: UInt8Array, task: str
     frames: uint8 [T, H, W, 3], T frames, H x W pixels, evenly thinned if the checkpoint takes fewer
     """
     from rfm_client.cli.pictures import Panel, plot
-    from rfm_client.cli.scoring import checkpoint_of, heading
+    from rfm_client.cli.scoring import heading
     from rfm_client.frames.video import frame_times_s
 
     with RewardClient(endpoints.grpc_url) as client:
         trajectory = Trajectory(frames=frames, task=task)
         result = client.progress(trajectory, subsample=True)
-        checkpoint = checkpoint_of(client, trajectory)
+        info = client.model_info(frames=True)
     if len(result.progress) < len(frames):
         typer.echo(f"{video.name}: {len(result.progress)} of {len(frames)} frames, evenly, are scored")
     print(scores_table(f'"{task}"', [(video.name, result)]))
-    if checkpoint == TOY:
-        typer.echo(f"note: {TOY}")
-    title = heading(task, [checkpoint])
+    if info.warning:
+        typer.echo(f"note: {info.warning}")
+    title = heading(task, [info])
     plot(picture, [Panel.of(video.name, result, frames, frame_times_s(video, len(frames)))], title)
     typer.echo(f"The curves are in {picture}.")
 

@@ -69,7 +69,10 @@ def test_scores_and_figures_of_the_toy_checkpoint_say_that_they_mean_nothing(
     words = ("--url", demo_server.grpc_url, "--task", TASK, "--plot", tmp_path / "plot.svg")
     result = invoke("score", video, *words)
     assert (result.exit_code, result.stderr.count(f"note: {TOY}")) == (0, 1)
-    assert TOY in (tmp_path / "plot.svg").read_text()
+    assert f"<!-- {TOY} -->" in (tmp_path / "plot.svg").read_text()
+    result = invoke("score", video, *words, "--caption", "how it went")
+    drawn = (tmp_path / "plot.svg").read_text()
+    assert all(f"<!-- {line} -->" in drawn for line in ("how it went", TOY))
 
 
 def test_scores_and_comparisons_fit_a_terminal_and_name_each_file(engines: EngineServer, videos: list[Path]) -> None:

@@ -155,9 +155,12 @@ def test_an_episode_on_the_hub_opens_once_it_is_downloaded_and_a_large_download_
         browser.until("document.querySelectorAll('#episode-videos video').length === 2")
         monkeypatch.setattr("rfm_labels.datasets.hub.ASK_BYTES", 10)
         browser.run("document.querySelector('#episodes tr[data-episode=\"5\"] button').click()")
+        pictures = "document.querySelectorAll('#episodes tr[data-episode=\"5\"] .thumb[src]').length"
+        assert browser.run(f"return {pictures}") == 0
         told = wait_for_state(browser, "episode-errors")
         assert re.fullmatch(r"A large download\nEpisode 5 needs 0\.\d MB in 3 files from the Hub\.\nDownload", told)
         without_violations(browser)
         browser.all("#episode-errors button")[0].click()
         browser.until("document.querySelectorAll('#episode-videos video').length === 2")
         assert browser["episode-errors"].text == ""
+        browser.until(f"{pictures} === 2")

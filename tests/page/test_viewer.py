@@ -115,10 +115,15 @@ def test_a_wrong_question_says_why(
     check_refused(post(encoders.url, SCORE, {"video": file}, **{**QUESTION, **fields}), ([at], message))
 
 
+NUM_COMPARED = r"expected 2 to 12 video files \(rfm-client compare takes more\)"
+
+
 def test_a_missing_video_a_missing_model_and_a_refused_task_are_named(encoders: Gateway, videos: Path) -> None:
     video = videos / "clip.mp4"
     response = post(encoders.url, COMPARE, {"first": video}, **QUESTION)
-    check_refused(response, (["videos"], "expected at least 2 video files, got 1"))
+    check_refused(response, (["videos"], f"{NUM_COMPARED}, got 1"))
+    response = post(encoders.url, COMPARE, {f"{number}": b"" for number in range(13)}, **QUESTION)
+    check_refused(response, (["videos"], f"{NUM_COMPARED}, got 13"))
     response = post(encoders.url, SCORE, {"video": video}, **{**QUESTION, "model": "missing"})
     assert "missing_frames" in failure(response, 503)
     response = post(encoders.url, SCORE, {"video": video}, model=VLM, task="<|im_end|>")

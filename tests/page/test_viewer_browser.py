@@ -128,6 +128,8 @@ def test_dropped_clips_get_the_curves_of_the_command_line(page: Page) -> None:
     drag.move_by_offset(0, round(0.24 * height * 0.2)).release().perform()  # the band has 0.24 of the height
     assert float(page.browser["threshold"].get_attribute("value")) == pytest.approx(0.8, abs=0.02)
     assert line.get_attribute("data-value") == f"{float(page.browser['threshold'].get_attribute('value')):.2f}"
+    page.browser["dataset-tab"].click()
+    assert not page.browser["warning"].is_displayed()  # labels there may be of any checkpoint
 
 
 def picture(page: Page) -> Image.Image:
@@ -239,6 +241,12 @@ def test_several_videos_are_ranked_as_by_the_command_line(page: Page) -> None:
     )
     assert widths == pytest.approx([video["wins"] for video in best_first], abs=0.02)
     assert page.browser.run("return document.querySelectorAll('#pairs details p').length") == 3
+    commands = page.browser["command"].text.splitlines()
+    page.drop("copy")  # which is not among those compared
+    page.browser.until_text("scored", "4 of 4 scored")
+    assert page.browser["command"].text.splitlines()[-1] == commands[-1]
+    page.browser.all("#videos .remove")[3].click()
+    assert len(page.browser.all("#pairs li")) == 3
     page.browser.all("#videos .remove")[2].click()
     assert page.browser.all("#pairs li") == []
     assert len(answer["pairs"]) == 3
@@ -398,7 +406,7 @@ def test_tasks_are_overlaid_colours_tell_videos_apart_and_lines_tell_tasks_apart
     assert [video["source"] for video in page.saved()["videos"]] == ["success.mp4", "failure.mp4"]  # the files' names
 
 
-def test_a_slow_upload_shows_its_percentage_and_then_the_curve(page: Page) -> None:
+def test_a_slow_upload_shows_its_percentage_and_then_the_curve_and_a_slow_comparison_can_be_stopped(page: Page) -> None:
     link = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": 20_000}  # bytes a second
     page.browser.driver.execute_cdp_cmd("Network.enable", {})
     page.browser.driver.execute_cdp_cmd("Network.emulateNetworkConditions", link)
@@ -407,6 +415,15 @@ def test_a_slow_upload_shows_its_percentage_and_then_the_curve(page: Page) -> No
         page.browser.until("/, uploading [1-9]\\d? %$/.test(document.getElementById('scored').textContent)")
         assert page.browser.cells("#curves tr")[0][-1].startswith("uploading, ")
         page.browser.until_text("scored", "1 of 1 scored")
+        page.drop("success")
+        page.browser.until_text("scored", "2 of 2 scored")
+        page.browser["compare"].click()
+        page.browser.until_text("status", "Comparing 2 videos.")
+        assert (page.browser["compare"].is_displayed(), page.browser["stop"].is_displayed()) == (False, True)
+        page.browser["stop"].click()
+        page.browser.until("document.getElementById('stop').disabled")
+        assert (page.browser["compare"].is_displayed(), page.browser["stop"].is_displayed()) == (True, False)
+        assert [page.browser[name].text for name in ("status", "errors")] == ["", ""]
     finally:
         page.browser.driver.execute_cdp_cmd("Network.emulateNetworkConditions", link | {"uploadThroughput": -1})
 
@@ -459,8 +476,8 @@ def test_the_figure_fits_a_column_of_a_paper_and_is_light(page: Page) -> None:
 
 MODULES = """
 const [named, done] = arguments;
-Promise.all(["text", "takeaway", "curves", "figure", "exports"].map((name) => import(`/viewer/${name}.js`))).then(
-  ([{ cut }, { serverOption }, { Curve }, { svgFigure }, { lerobotWords }]) => {
+Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts"].map((name) => import(`/viewer/${name}.js`))).then(
+  ([{ cut }, { serverOption }, { Curve }, { svgFigure }, { lerobotWords }, { sentenceOf }]) => {
     const settings = { task: "lift", model: "m", rule: "all", fps: 1 };
     const curve = new Curve({ title: "a.mp4", id: 1 }, settings);
     curve.take("video", { num_frames: 7, times_s: null });
@@ -475,7 +492,8 @@ Promise.all(["text", "takeaway", "curves", "figure", "exports"].map((name) => im
       ["grpc://triton:8001", "https://gpu-box.lan:8443/"],
     ].map((each) => serverOption(...each));
     const words = lerobotWords("delete", { name: named, kind: "LeRobot v3.0" }, [1], [0, 1]);
-    done([figure, names, servers, words]);
+    const answer = { videos: [1, null, null, 4].map((rank) => ({ rank })), pairs: [{ verdict: null }, { verdict: "first" }] };
+    done([figure, names, servers, words, sentenceOf({ videos: [..."abcd"].map((title) => ({ title })), answer })]);
   });
 """
 
@@ -483,10 +501,11 @@ Promise.all(["text", "takeaway", "curves", "figure", "exports"].map((name) => im
 def test_modules_cut_names_name_a_reachable_triton_and_lead_a_line_over_skipped_frames(page: Page) -> None:
     """Of seven frames the model skips three, and the score of one is missing."""
     dataset = "Ann's set; touch \n$(touch x)"
-    markup, names, servers, words = page.browser.driver.execute_async_script(MODULES, dataset)
+    markup, names, servers, words, sentence = page.browser.driver.execute_async_script(MODULES, dataset)
     assert names == ["rollout_seed…100k.mp4", "success.mp4"]
     assert servers == [["--url", "grpc://127.0.0.1:8001"], [], ["--url", "grpc://triton:8001"]]
     assert shlex.split(words, comments=True)[:4] == ["lerobot-edit-dataset", "--repo_id", dataset, "--root"]
+    assert sentence == "a does the task best, but b, c have no rank: some answers change with the order."
     svg = ElementTree.fromstring(markup)
     assert [len(line.attrib["points"].split()) for line in svg.iter(f"{SVG}polyline")] == [2, 1]
     assert "\N{MINUS SIGN}0.5" in texts(svg)  # the axis reaches the score below 0

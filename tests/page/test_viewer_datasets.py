@@ -9,7 +9,9 @@ import json
 import os
 import re
 import shutil
+import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
@@ -20,6 +22,7 @@ import h5py
 import numpy as np
 import pyarrow as pa
 import pytest
+import requests
 from PIL import Image
 from pyarrow import parquet
 
@@ -27,13 +30,14 @@ import clip
 import hdf5_writers as writers
 import local_hub
 from gateway_requests import failure
-from gateways import inside
+from gateways import StandIn, inside, listening
 from labelling import LEROBOT, BrightnessScorer
 from paths import ROOT
-from rfm_client.frames import read_video
+from rfm_client.frames import cached_snapshot, read_video
 from rfm_client.options import ConfigError
 from rfm_labels import LabelOptions, label, open_dataset, read_episode_labels
 from rfm_labels.datasets import LeRobotDataset, open_to_show
+from servers import PATIENCE_S, wait_for
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew, hdf5
 
 V21, V30 = range(2)  # datasets with labels; one without follows
@@ -200,6 +204,14 @@ def test_pictures_are_shown_as_a_video(tmp_path: Path, make: Callable[[Path], Pa
     assert np.abs(shown.astype(int) - expected).mean() < 4  # colours at half the resolution
 
 
+def test_times_are_those_of_a_camera_that_counts(tmp_path: Path) -> None:
+    (tmp_path / "0").mkdir()
+    for camera, num_frames in (("depth", 3), ("front", 4)):
+        clip.write(tmp_path / "0" / f"{camera}.mp4", writers.video(num_frames), 5)
+    with serving(f"{{episode}}/{{camera}}.mp4={tmp_path}") as get:
+        assert get("/0/episodes/0").json()["times_s"] == pytest.approx([0, 0.2, 0.4, 0.6])
+
+
 def test_labels_beside_an_hdf5_file_are_shown(tmp_path: Path) -> None:
     file = hdf5(tmp_path)
     label(open_dataset(file), BrightnessScorer(), LabelOptions())
@@ -271,6 +283,8 @@ def test_of_a_dataset_on_the_hub_only_the_watched_episode_is_downloaded_after_it
             [each.index, each.task, each.num_frames] for each in LeRobotDataset(source).episodes
         ]
         assert (get("/0/faults").json(), get(f"{path}/preview").json()["pictures"]) == ({}, [])
+        for each in (path, f"{path}/videos/0"):
+            assert failure(get(each), 409).endswith("MB in 3 files on the Hub: download it first")
         assert here() == []
         needed = [
             "data/chunk-000/episode_000003.parquet",
@@ -289,6 +303,37 @@ def test_of_a_dataset_on_the_hub_only_the_watched_episode_is_downloaded_after_it
         assert here() == needed
     with serving(source) as get:
         assert get(f"{path}/missing").json() == all_here
+
+
+def test_a_download_waits_for_the_one_before_also_if_its_caller_has_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    is_open = threading.Event()
+
+    def slow(name: str, kind: str, revision: str | None, patterns: list[str]) -> Path:
+        asked.append(patterns[-1])
+        assert patterns[0].startswith("meta/") or is_open.wait(PATIENCE_S)
+        return cached_snapshot(name, kind, revision, patterns)
+
+    monkeypatch.setattr("rfm_labels.datasets.hub.cached_snapshot", slow)
+    with (
+        local_hub.hub({HUB_ID: {"main": LEROBOT / "toy_v21"}}, "datasets") as endpoint,
+        local_hub.asked(endpoint, tmp_path / "hub"),
+        listening(StandIn(), dataset=(HUB_ID,)) as gateway,
+        ThreadPoolExecutor() as callers,
+    ):
+        first, begun = gateway.connect(), len(asked)
+        first.request("POST", "/viewer/datasets/0/episodes/3/missing")
+        wait_for(lambda: len(asked) == begun + 1)
+        first.close()
+        second = callers.submit(requests.post, f"{gateway.url}/viewer/datasets/0/episodes/5/missing")
+        for _ in range(5):  # there is time to begin
+            assert gateway.get("/viewer/datasets").ok
+        assert (len(asked), second.done()) == (begun + 1, False)
+        is_open.set()
+        assert second.result(PATIENCE_S).json() == {"size": None, "asks": False}
+        assert gateway.get("/viewer/datasets/0/episodes/3").ok
 
 
 def test_an_episode_that_needs_frames_behind_its_end_is_refused(tmp_path: Path) -> None:

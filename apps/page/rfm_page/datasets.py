@@ -31,11 +31,6 @@ class ShownLeRobot(ShownDataset):
     dataset: LeRobotDataset
 
     @property
-    def bounds(self) -> Path:
-        """The folder; in the Hub's cache that of the repository, to whose blobs a commit's files are links."""
-        return self.root if self.dataset.revision is None else self.root.parents[1].resolve()
-
-    @property
     def has_stored_pixels(self) -> bool:
         """True if all cameras have videos."""
         return not self.dataset.info.images

@@ -70,20 +70,28 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
 def dataset_routes(datasets: Sequence[ShownDataset], limits: BodyLimits) -> APIRouter:
     """Return the endpoints for the page's datasets. The evaluation server has no such endpoints."""
     router = APIRouter(include_in_schema=False)
-    downloading = asyncio.Lock()  # one at a time, since each holds a thread
+    downloading = asyncio.Lock()
 
-    async def read(
-        request: Request, number: int, reading: Callable[[ShownDataset], Read], up_to_s: float | None = limits.timeout_s
-    ) -> Read:
+    def numbered(number: int) -> ShownDataset:
+        if not 0 <= number < len(datasets):
+            raise HTTPException(404, f"dataset: expected one of {len(datasets)}, got {number}")
+        return datasets[number]
+
+    async def read(request: Request, number: int, reading: Callable[[ShownDataset], Read]) -> Read:
         """Check a dataset and read from it, in a thread, and return the result.
 
         Raises HTTPException 404 for a missing part, 500 for a broken dataset, 504 if reading takes too long.
         """
-        if not 0 <= number < len(datasets):
-            raise HTTPException(404, f"dataset: expected one of {len(datasets)}, got {number}")
-        with anyio.move_on_after(up_to_s):
-            return await while_connected(request, asyncio.to_thread(datasets[number].read, reading))
-        raise HTTPException(504, f"dataset: expected an answer within {up_to_s:g} s, got none")
+        with anyio.move_on_after(limits.timeout_s):
+            return await while_connected(request, asyncio.to_thread(numbered(number).read, reading))
+        raise HTTPException(504, f"dataset: expected an answer within {limits.timeout_s:g} s, got none")
+
+    async def downloaded(dataset: ShownDataset, episode: int) -> dict[str, Any]:
+        """Download what an episode lacks, after other downloads. The thread goes on if the caller leaves."""
+        await downloading.acquire()
+        thread = asyncio.create_task(asyncio.to_thread(dataset.read, lambda shown: shown.download(episode)))
+        thread.add_done_callback(lambda _: downloading.release())
+        return await asyncio.shield(thread)
 
     @router.get("/viewer/datasets")
     async def names() -> Response:
@@ -108,8 +116,7 @@ def dataset_routes(datasets: Sequence[ShownDataset], limits: BodyLimits) -> APIR
 
     @router.post("/viewer/datasets/{dataset}/episodes/{episode}/missing")
     async def download(request: Request, dataset: int, episode: int) -> Response:
-        async with downloading:
-            return _json(await read(request, dataset, lambda shown: shown.download(episode), up_to_s=None))
+        return _json(await while_connected(request, downloaded(numbered(dataset), episode)))
 
     @router.get("/viewer/datasets/{dataset}/episodes/{episode}/preview")
     async def preview(request: Request, dataset: int, episode: int, labels: str | None = None) -> Response:

@@ -42,7 +42,7 @@ from rfm_client.serving import off_loop
 from rfm_gateway.mounting import GatewayConfig, PageHost, Upload, invalid, while_connected
 from rfm_page.questions import DEFAULT_FPS, ShownVideo, VideoRequest
 
-MIN_COMPARED = 2  # videos
+MIN_COMPARED, MOST_COMPARED = 2, 12  # videos; 12 have 132 questions, and as many colours as the page knows
 MOST_PREFIXES = 32  # in a request
 MOST_BYTES = 64 * 2**20  # for all frames in a request
 STATUS_TIMEOUT_S = 5.0
@@ -98,8 +98,6 @@ def viewer_routes(host: PageHost) -> APIRouter:
     @router.post("/viewer/compare", dependencies=[host.place])
     async def compare(request: Request) -> Response:
         asked = await read(request)
-        if len(asked.videos) < MIN_COMPARED:
-            raise invalid(("videos",), f"expected at least {MIN_COMPARED} video files, got {len(asked.videos)}")
         async with config.client(asked.question.model) as client:
             answer = await while_connected(request, _ranking(client, asked))
         metrics.samples.labels("preference").inc(len(answer["orders"]))
@@ -111,6 +109,9 @@ def viewer_routes(host: PageHost) -> APIRouter:
         Raises RequestValidationError, HTTPException and RewardError.
         """
         fields, uploads = await limits.form(request)
+        if not names and not MIN_COMPARED <= len(uploads) <= MOST_COMPARED:
+            expected = f"{MIN_COMPARED} to {MOST_COMPARED} video files (rfm-client compare takes more)"
+            raise invalid(("videos",), f"expected {expected}, got {len(uploads)}")
         question = VideoRequest.of(fields, config.checkpoint)
         async with config.client(question.model) as client:
             info = await client.model_info(frames=True)

@@ -53,7 +53,8 @@ class ShownDataset:
     """A dataset for the page, whose pictures are encoded as videos.
 
     dataset: as ``open_to_show`` returns it
-    Methods raise DatasetError for a broken dataset, HTTPException 404 for a missing episode, camera or label file.
+    Methods raise DatasetError for a broken dataset, HTTPException 404 for a missing episode, camera or label file, 409
+    for an episode that must be downloaded first.
     """
 
     dataset: Dataset
@@ -68,14 +69,10 @@ class ShownDataset:
         """The folder or file."""
         return self.root
 
-    @property
-    def bounds(self) -> Path:
-        """The folder that the dataset's files must be in, with links resolved."""
-        return self.root
-
     def check(self) -> None:
         """Raise DatasetError if the dataset would show other files from this machine. Called before every read."""
-        check_links(self.bounds, links_in(self.root))
+        if self.dataset.revision is None:  # else all links are those that huggingface_hub made in its cache
+            check_links(self.root, links_in(self.root))
 
     @property
     def has_stored_pixels(self) -> bool:
@@ -231,7 +228,10 @@ class ShownDataset:
         return message.replace(str(self.root), self.dataset.source)
 
     def _episode(self, number: int) -> DatasetEpisode:
-        return self.dataset.episode(self._numbered(number))
+        self._numbered(number)
+        if not self.dataset.is_here(number) and (size := self.dataset.missing([number], self.cameras)):
+            raise HTTPException(409, f"episode {number}: expected it here, got {size} on the Hub: download it first")
+        return self.dataset.episode(number)
 
     def _numbered(self, number: int) -> int:
         known = self.dataset.numbers

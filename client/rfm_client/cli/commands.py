@@ -40,7 +40,6 @@ from rfm_client.cli.options import (
     WaitOptions,
 )
 from rfm_client.cli.show import scores_table, status_tables, wrapped
-from rfm_client.contract.description import TOY
 from rfm_client.contract.errors import DeadlineExceededError, RewardError
 from rfm_client.contract.results import FRAME_SCORES
 from rfm_client.plot import save
@@ -113,18 +112,17 @@ def score(
         outcomes = scoring.SourceScorer(client, video, prefix, recording).score_all(videos, tell)
     if output.prints_tables and shown:
         print("\n" + wrapped(prefix.rule, "  ", "  "))
-    if any(each.checkpoint == TOY for each in shown):
-        report(f"note: {TOY}")
+    infos = [outcome.info for outcome in shown]
+    for warning in dict.fromkeys(info.warning for info in infos if info.warning):
+        report(f"note: {warning}")
     output.write_json(documents.score_document(server, video, prefix, outcomes))
-    caption = output.caption
-    if caption is None:
-        caption = scoring.heading(video.task, [outcome.checkpoint for outcome in shown])
+    title = scoring.heading(video.task, infos, output.caption)
     if output.plot is not None and shown:
-        save(scoring.figure(shown, caption, output.size), output.plot)
+        save(scoring.figure(shown, title, output.size), output.plot)
     if output.strips is not None and shown:
         from rfm_client.cli.pictures import plot
 
-        plot(output.strips, [outcome.panel for outcome in shown], caption, size=output.size)
+        plot(output.strips, [outcome.panel for outcome in shown], title, size=output.size)
     raise typer.Exit(scoring.exit_code_of_outcomes(outcomes))
 
 

@@ -19,6 +19,7 @@ from rfm_client.cli.pictures import Panel
 from rfm_client.cli.show import Table, at_end, number, title_at_end
 from rfm_client.client import RewardClient
 from rfm_client.contract.checks import is_blank
+from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import (
     DeadlineExceededError,
     InvalidSampleError,
@@ -77,13 +78,12 @@ class Source:
 class Scored:
     """A source's scores, ready to show.
 
-    checkpoint: as in ``checkpoint_of``
     num_frames: frames that were read
     times_s: float64 [T], times of the T scored frames; None: unknown
     """
 
     name: str
-    checkpoint: str
+    info: ModelInfo
     result: ProgressResult
     num_frames: int
     times_s: Times | None
@@ -154,7 +154,7 @@ class SourceScorer:
             if self._gone is not None:
                 return Failed(name, self._gone, NOT_ASKED, is_server_gone=True)
             result = _evaluate(self.client, source.trajectory, self.video, self.prefix)
-            checkpoint = checkpoint_of(self.client, source.trajectory)
+            info = self.client.model_info(frames=source.trajectory.frames is not None)
         except ImportError as error:
             return Failed(name, error, missing_package(error))
         except (RewardError, OSError) as error:
@@ -165,7 +165,7 @@ class SourceScorer:
             self.recording.add(stem, result, source.trajectory.frames, source.times_s)
         return Scored(
             name=name,
-            checkpoint=checkpoint,
+            info=info,
             result=result,
             num_frames=source.trajectory.num_frames,
             times_s=source.times_of(result),
@@ -216,17 +216,17 @@ def _evaluate(
     return client.curve(trajectory, sampling, **options)
 
 
-def checkpoint_of(client: RewardClient, trajectory: Trajectory) -> str:
-    """Return what a figure says of the checkpoint that scores the trajectory: a warning, its source or its name."""
-    info = client.model_info(frames=trajectory.frames is not None)
-    source = info.warning or info.source or info.name
+def heading(task: str, infos: Iterable[ModelInfo], caption: str | None = None) -> str:
+    """Return a figure's title: the caption, else the task and the checkpoints; a warning replaces a name."""
+    title = f'"{task}"' * (not is_blank(task)) if caption is None else caption
+    told = (info.warning or (_checkpoint(info) if caption is None else "") for info in infos)
+    return "\n".join(filter(None, [title, ", ".join(filter(None, dict.fromkeys(told)))]))
+
+
+def _checkpoint(info: ModelInfo) -> str:
+    source = info.source or info.name
     run = source.removesuffix("/checkpoint")  # a name, unless the folder is a version
     return source if run.isdecimal() else run
-
-
-def heading(task: str, checkpoints: Iterable[str]) -> str:
-    """Return a figure title: the task, and below it the checkpoints."""
-    return "\n".join([*[f'"{task}"'] * (not is_blank(task)), ", ".join(dict.fromkeys(checkpoints))])
 
 
 def figure(scored: Sequence[Scored], title: str, size: Size) -> Figure:

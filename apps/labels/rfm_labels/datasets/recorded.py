@@ -112,12 +112,16 @@ class RecordedDataset(CountedDataset):
         raise faults[numbers[0]] if whole else FaultsError.of(faults, numbers)
 
     def length(self, number: int) -> int:
+        return self._measured(number)[1]
+
+    def _measured(self, number: int) -> tuple[Stored, int]:
+        """The first camera that can be read, used ones first, and its count, which is the episode's."""
         fault: RewardError | None = None
         own = self.recorded[number].cameras
         unused = self.unused_cameras(list(own))
         for camera in sorted(own, key=lambda each: (each in unused, each not in self.cameras)):
             try:
-                return own[camera].count  # of the first camera that can be read
+                return own[camera], own[camera].count
             except RewardError as error:
                 fault = fault or error
         self.cameras_in([number])  # raises the reason if there is no camera
@@ -129,8 +133,7 @@ class RecordedDataset(CountedDataset):
         return DatasetEpisode(number, one.name, task, length, self.frames_before(number))
 
     def times_s(self, episode: DatasetEpisode) -> Times | None:
-        first = next(iter(self.recorded[episode.index].cameras.values()))
-        return first.times_s if self.fps is None else None
+        return self._measured(episode.index)[0].times_s if self.fps is None else None
 
     def decoder(self, camera: str) -> str | None:
         kinds = {type(one.cameras[camera]) for one in self.recorded.values() if camera in one.cameras}

@@ -498,6 +498,7 @@ export class DatasetTab {
     const other = this.#page.others.value;
     const names = [this.#labels, ...(other ? [other] : [])];
     await this.#download(episode, signal);
+    if (this.#told.is_on_hub) this.#table.refill(episode); // also after a download that went on without the page
     const told = await Promise.all(names.map((name) => curvesOf(this.#number, episode, name, signal)));
     const curves = [...curvesIn(told[0], null), ...told.slice(1).flatMap((each) => curvesIn(each, other).slice(0, 1))];
     this.#timeline.time = 0;

@@ -112,6 +112,13 @@ export class EpisodeTable {
     if (episode) this.#rows.reveal(episode);
   }
 
+  /** Fills the row of an episode, by its number, which has come from the Hub. */
+  refill(number) {
+    this.#previews.forget(number);
+    const [episode, row] = [...this.#rows.rows].find(([each]) => each.episode === number) ?? [];
+    if (row) this.#previews.fill(episode, row, row.querySelectorAll(".thumb"), row.querySelector(".spark"));
+  }
+
   /** Shows which are selected. */
   markChosen() {
     for (const [{ episode }, row] of this.#rows.rows) row.querySelector("input").checked = this.#chosen.has(episode);

@@ -45,6 +45,7 @@ let curves = [];
 let verdicts = [];
 const gateway = { models: [], rules: [], url: "" };
 let stopping = new AbortController();
+let comparing = null; // ends the comparison on the way
 
 const askingServer = new Asking(askServer);
 const askingModels = new Asking(askServed);
@@ -304,26 +305,30 @@ async function compareAll() {
   const { model, fps, resize } = settings();
   const { orient, channels } = all[0];
   const before = verdicts.length;
+  const { signal } = comparing = new AbortController();
   places.errors.clear();
-  page.compare.disabled = true;
+  update();
   try {
     if (!tasks().length) throw new Error("task: expected a sentence, got none");
     for (const name of ["orient", "channels"]) {
       const other = all.find((video) => video[name] !== all[0][name]);
       if (other) throw new Error(`${name}: expected the same of all videos, got ${all[0][name]} and ${other[name]}`);
     }
+    page.status.textContent = `Comparing ${all.length} videos.`;
     const twice = await ofOneFile(all);
+    signal.throwIfAborted();
     if (twice) tell({ videos: twice, answer: null });
     for (const task of twice ? [] : tasks()) {
       const files = Object.fromEntries(all.map(({ file }, index) => [`video_${index}`, file]));
-      const answer = await compare(form({ task, model, fps, orient, channels, resize }, files), stopping.signal);
+      const answer = await compare(form({ task, model, fps, orient, channels, resize }, files), signal);
       tell({ videos: all, task, model, fps, orient, channels, resize, answer });
     }
   } catch (error) {
-    if (!stopping.signal.aborted) failed(error, "The videos could not be compared", compareAll);
+    if (!signal.aborted) failed(error, "The videos could not be compared", compareAll);
   }
+  comparing = null;
   update();
-  if (verdicts.length > before) page.status.textContent = verdicts.slice(before).map(sentenceOf).join(" ");
+  if (!signal.aborted) page.status.textContent = verdicts.slice(before).map(sentenceOf).join(" ");
 }
 
 /** Shows a verdict, and scrolls to it. */
@@ -336,8 +341,10 @@ function tell(verdict) {
 
 function stop() {
   queue.clear();
+  comparing?.abort();
   stopping.abort();
   stopping = new AbortController();
+  page.status.textContent = "";
   for (const curve of curves.filter(({ state }) => state === "waiting")) {
     Object.assign(curve, { state: "failed", error: "stopped" });
   }
@@ -351,7 +358,6 @@ function clear() {
   verdicts = [];
   page.pairs.replaceChildren();
   places.errors.clear();
-  page.status.textContent = "";
   timeline.moveTo(0);
   update();
 }
@@ -389,6 +395,7 @@ function restore({ entries, curves: old, verdicts: oldVerdicts }) {
 
 function removeVideo(video) {
   videos.remove(video);
+  comparing?.abort();
   for (const curve of curves.filter((each) => each.video === video)) forget(curve);
   verdicts = verdicts.filter((verdict) => !verdict.videos.includes(video));
   page.status.textContent = "";
@@ -468,8 +475,8 @@ function update() {
     videos.tell(video, own.map(({ state }) => state));
   }
   showTable(page.curves, curves, Number(page.threshold.value));
-  page.stop.disabled = queue.isIdle;
-  page.compare.disabled = videos.all.length < 2 || !page.model.value;
+  page.stop.disabled = queue.isIdle && !comparing;
+  page.compare.disabled = videos.all.length < 2 || !page.model.value || Boolean(comparing);
   page.take.hidden = !scored.length && !answered().length;
   page.verdicts.hidden = !verdicts.length;
   page.png.disabled = page.svg.disabled = page.csv.disabled = !scored.length;

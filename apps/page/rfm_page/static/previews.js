@@ -44,6 +44,11 @@ export class Previews {
     this.#timer = setTimeout(() => this.#next(), REST_MS);
   }
 
+  /** Forgets an episode, of which there is more now. */
+  forget(number) {
+    this.#known?.delete(number);
+  }
+
   #next() {
     this.#waiting = this.#waiting.filter(({ row }) => row.isConnected);
     while (this.#numAsked < AT_A_TIME && this.#waiting.length) this.#fetch(this.#waiting.shift());

@@ -13,7 +13,8 @@ export function sentenceOf({ videos, answer }) {
   const best = answer.videos.findIndex(({ rank }) => rank === 1);
   if (answer.pairs.every(({ verdict }) => verdict)) return `${videos[best].title} does the task ${videos.length > 2 ? "best" : "better"}.`;
   const [{ orders_agree: agree }, ...others] = answer.pairs;
-  if (others.length) return `${best < 0 ? "No ranking" : `${videos[best].title} does the task best, but the others have no rank`}: some answers change with the order.`;
+  const unranked = videos.filter((_, index) => answer.videos[index].rank === null).map(({ title }) => title).join(", ");
+  if (others.length) return `${best < 0 ? "No best video" : `${videos[best].title} does the task best, but ${unranked} have no rank`}: some answers change with the order.`;
   return agree ? "No verdict: both answers are exactly 0.5." : "No verdict: the answer changes with the order.";
 }
 

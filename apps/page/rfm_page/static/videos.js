@@ -59,7 +59,7 @@ export class Videos {
     player.addEventListener("seeked", () => this.#arrived(entry));
     figure.append(caption, player, trouble);
     this.#host.append(figure);
-    this.#entries.push(entry);
+    this.#entries = [...this.#entries, entry]; // whoever has `all` keeps that list
     this.#fit();
     return entry;
   }
