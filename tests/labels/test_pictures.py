@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps, PngImagePlugin
 
+from labelling import BrightnessScorer, Notes
 from pictures import numbered, numbers
 from rfm_client import UInt8Array
-from rfm_labels import DatasetError, open_dataset
+from rfm_labels import DatasetError, LabelOptions, label, open_dataset
 from rfm_labels.audit import audit
 from rfm_labels.datasets.pictures_in_order import in_order_of_numbers
 from rfm_labels.datasets.stored_files import digest_of, file_identity
@@ -83,6 +84,12 @@ def test_a_dry_run_doubts_missing_numbers(tmp_path: Path, names: Sequence[str], 
     doubts = [str(each) for each in audit(dataset, dataset.episodes, dataset.cameras) if "no picture" in each.text]
     assert len(doubts) == (told is not None)
     assert all(doubt.startswith(f"episode 0: frames: no picture between {told}") for doubt in doubts)
+
+
+def test_a_run_notes_missing_numbers(tmp_path: Path) -> None:
+    dataset, notes = open_dataset(stored(tmp_path / "data", ["1.png", "2.png", "4.png", "5.png"]), task=TASK), Notes()
+    label(dataset, BrightnessScorer(), LabelOptions(output=tmp_path), notes)
+    assert "doubt: episode 0: frames: no picture between 2.png and 4.png; were frames dropped?" in notes.lines
 
 
 def of_cameras(pattern: str, cameras: Sequence[object], count: int = 3) -> list[str]:

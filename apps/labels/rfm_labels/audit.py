@@ -45,6 +45,12 @@ class Doubt:
         return ": ".join([*places, *([self.camera] if self.camera else []), self.text])
 
 
+def doubts_of_files(dataset: Dataset, episodes: Sequence[DatasetEpisode], cameras: Sequence[str]) -> list[Doubt]:
+    """Return the doubts that need no decoding."""
+    pairs = ((episode, camera) for episode in episodes for camera in cameras)
+    return [Doubt.of(text, *pair) for pair in pairs if (text := dataset.doubt(*pair))]
+
+
 def audit(
     dataset: Dataset, episodes: Sequence[DatasetEpisode], cameras: Sequence[str], watch: Watch = QUIET
 ) -> list[Doubt]:
@@ -65,10 +71,7 @@ def audit(
             continue
         if missing := [each.index for each in episodes if outcomes.get(each.index) is None]:
             doubts.append(Doubt(f"{name}: {counted(len(missing), 'episode')} without an outcome: {listed(missing)}"))
-    for episode in episodes:
-        for camera in cameras:
-            if text := dataset.doubt(episode, camera):
-                doubts.append(Doubt.of(text, episode, camera))
+    doubts += doubts_of_files(dataset, episodes, cameras)
     chosen = _neighbours(len(episodes))
     watch.checking(len(chosen))
     last: dict[str, UInt8Array] = {}  # last frame by camera, of the episode before

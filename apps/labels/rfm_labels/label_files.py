@@ -231,7 +231,8 @@ class LabelFile:
         got = f"those of {listed(lost)}, too"
         require(self.path, not lost, "labels of the chosen episodes alone", got)
         changed = sorted(number for number, digest in self.digests.items() if planned[number] != digest)
-        got = f"others for {listed(changed)}, whose frames or rows have changed (copy videos with their times: cp -p)"
+        why = "whose frames or rows have changed, or their tasks (copy videos with their times: cp -p)"
+        got = f"others for {listed(changed)}, {why}"
         require(self.path, not changed, "labels of the episodes as they are now", got)
 
 

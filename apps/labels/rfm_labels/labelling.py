@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from rfm_client.options import counted
+from rfm_labels.audit import doubts_of_files
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset
-from rfm_labels.datasets.faults import DatasetError
+from rfm_labels.datasets.faults import DatasetError, shortened
 from rfm_labels.label_files import LabelFile
 from rfm_labels.metadata import PROGRESS, SCORES, blank_from_metadata, blank_lines, skipping_in, values_of
 from rfm_labels.options import DEFAULTS, QUIET, LabelOptions, Watch
@@ -64,7 +65,7 @@ def label(dataset: Dataset, scorer: Scorer, options: LabelOptions = DEFAULTS, wa
 def planned(dataset: Dataset, scorer: Scorer, outputs: Outputs, watch: Watch = QUIET, *, writes: bool = False) -> Plan:
     """Check everything that the run needs before scoring starts, and return the plan.
 
-    writes: True: create the folder for the label files
+    writes: True: create the folder for the label files, and note doubts that need no decoding
 
     Raises DatasetError, also for existing label files that this run may not replace.
     """
@@ -83,6 +84,9 @@ def planned(dataset: Dataset, scorer: Scorer, outputs: Outputs, watch: Watch = Q
             labels = f"its labels of {counted(len(file.digests), 'episode')} are" if file.digests else "it is"
             watch.note(f"--overwrite: {error}; {labels} replaced")
     checked_episodes(dataset, options, watch)  # after the cheap refusals
+    doubts = doubts_of_files(dataset, plan.episodes, plan.recipe.decoded_cameras) if writes else []
+    for line in shortened([f"doubt: {doubt}" for doubt in doubts]):
+        watch.note(line)
     return plan
 
 

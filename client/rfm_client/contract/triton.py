@@ -80,7 +80,7 @@ _START = (
 )
 _GRPC_PORT = "give that port, or http:// for the HTTP port, or grpcs:// with TLS"
 _NAME = "give the checkpoint's name with model (--model)"
-_SHOW_KEY = "show the key that it wants with api_key (--api-key-file) or headers"
+_SHOW_KEY = "none was shown, or another: show the key that it wants with api_key (--api-key-file) or headers"
 _TRUST = {
     "WRONG_VERSION_NUMBER": "use grpc:// or http:// for a server without TLS",
     "[Hh]ostname|IP address mismatch": "use a host name in the URL that its certificate has",
