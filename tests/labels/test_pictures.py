@@ -89,7 +89,10 @@ def test_a_dry_run_doubts_missing_numbers(tmp_path: Path, names: Sequence[str], 
 def test_a_run_notes_missing_numbers(tmp_path: Path) -> None:
     dataset, notes = open_dataset(stored(tmp_path / "data", ["1.png", "2.png", "4.png", "5.png"]), task=TASK), Notes()
     label(dataset, BrightnessScorer(), LabelOptions(output=tmp_path), notes)
-    assert "doubt: episode 0: frames: no picture between 2.png and 4.png; were frames dropped?" in notes.lines
+    assert (
+        "doubt: episode 0: frames: no picture between 2.png and 4.png; were frames dropped while recording?"
+        in notes.lines
+    )
 
 
 def of_cameras(pattern: str, cameras: Sequence[object], count: int = 3) -> list[str]:
