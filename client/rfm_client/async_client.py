@@ -157,9 +157,11 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
         if options.pop("resize", False) and info.frame_size is not None:  # once, because prefixes share frames
             shrink = partial(resize_frames, size=info.frame_size)
             trajectory = await asyncio.to_thread(with_pictures, trajectory, shrink)
+        request_ids = self._call(options).request_ids  # counted through all requests
 
         def begin() -> Call:
             call = self._call(options)
+            call.request_ids = request_ids
             call.checks_blank = False  # a prefix may repeat the first frame
             return call
 

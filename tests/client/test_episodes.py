@@ -148,7 +148,9 @@ def test_a_curve_sends_each_frame_once_unless_the_server_forgets(
     monkeypatch.setattr(scorer, "MOST_REFUSALS", 1)
     transport, trajectory = Recording(engines.url), Trajectory(frames=frames, task=TASK)
     with RewardClient([], transports=[transport], model=model) as client:
-        scores = client.curve(trajectory, FOUR, go_on=engines.forget_features if forgets else None)
+        go_on = engines.forget_features if forgets else None
+        scores = client.curve(trajectory, FOUR, go_on=go_on, request_id="mine")
+        assert transport.request_ids == [f"mine-{number}" for number in range(1, len(transport.requests) + 1)]
         sent = [int(inputs["frames"].any(axis=(2, 3, 4)).sum()) for inputs in transport.requests]
         shown = [len(np.unique(inputs["frame_digests"].reshape(-1, 32), axis=0)) for inputs in transport.requests]
         if forgets:  # two requests were refused; then all frames came at once

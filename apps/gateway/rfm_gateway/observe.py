@@ -34,7 +34,7 @@ CALLER_LEFT = 499  # as nginx logs it
 
 REQUEST_ID_HEADER = "X-Request-ID"
 RETRY_AFTER = {"Retry-After": "1"}
-LARGEST_BODIES = 8  # so many of the largest size may be in memory
+LARGEST_BODIES = 8  # bodies of the largest size that may be in memory together
 
 _BUCKETS_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0)
 
