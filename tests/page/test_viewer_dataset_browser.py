@@ -355,6 +355,30 @@ def test_a_video_shows_the_frame_of_the_time(page: Page) -> None:
             assert off[t] == off.min() < 3, (t, off)
 
 
+HAVE_PLAYHEADS = "return [...document.querySelectorAll('#episode .playhead')].map((each) => !each.hidden)"
+ZOOM = """
+const over = document.querySelector("#motion-chart .u-over");
+const { left, width } = over.getBoundingClientRect();
+over.dispatchEvent(new WheelEvent("wheel", { clientX: left + width / 2, deltaY: arguments[0], ctrlKey: true }));
+"""
+
+
+def test_actions_and_states_move_and_zoom_with_the_curves(page: Page) -> None:
+    rows = parquet.read_table(page.choose(DEMO).root / "data" / "chunk-000" / "file-000.parquet").to_pylist()
+    page.at_rest(5)
+    own = [row for row in rows if row["episode_index"] == 5]
+    assert [each.text for each in page.browser.all("#motion-legend li")] == ["dx", "dy", "x", "y"]
+    page.move_to(0.7)
+    for signal, column, names in (("action", "action", "dx dy"), ("state", "observation.state", "x y")):
+        told = page.browser.values("motion-chart", signal)
+        assert list(told) == names.split()
+        assert [float(text) for text in told.values()] == pytest.approx(own[7][column], abs=0.006)
+    page.browser.run(ZOOM, -600)  # an eighth of the time is shown, from the middle
+    assert page.browser.run(HAVE_PLAYHEADS) == [False, False]
+    page.browser.run(ZOOM, 600)
+    assert page.browser.run(HAVE_PLAYHEADS) == [True, True]
+
+
 def test_an_episode_is_scored_as_it_was_for_the_labels_and_one_without_labels_too(page: Page) -> None:
     dataset = page.choose(DEMO)
     page.at_rest(0)

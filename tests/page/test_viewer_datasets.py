@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from itertools import product
+from itertools import cycle, islice, product
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ import av
 import h5py
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute
 import pytest
 import requests
 from PIL import Image
@@ -122,6 +123,36 @@ def test_a_preview_has_the_first_and_the_last_frame_as_for_the_labels_and_a_few_
     assert plain["progress"] == []
     assert plain["pictures"]
     assert "expected one from 0 to" in failure(get("/0/episodes/99/preview"), 404)
+
+
+NAMES = {"grouped": {"motors": ["dx"], "gripper": ["dy"]}, "by position": {"dx": 0, "dy": 1}, "of others": ["dx"]}
+
+
+@pytest.mark.parametrize("kind", [*NAMES, "as stored"])
+def test_actions_and_states_are_those_of_the_rows_under_their_names(tmp_path: Path, kind: str) -> None:
+    root = copied("toy_v30_many", tmp_path)
+    info = json.loads((root / "meta" / "info.json").read_text())
+    info["features"]["action"]["names"] = NAMES.get(kind, ["dx", "dy"])
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    with serving(root) as get:
+        motion = get("/0/episodes/2").json()["motion"]
+        expected = {"action": ["0", "1"] if kind == "of others" else ["dx", "dy"], "state": ["x", "y"]}
+        assert {name: each["names"] for name, each in motion.items()} == expected
+        file = root / "data" / "chunk-000" / "file-000.parquet"
+        table = parquet.read_table(file)
+        of_episode = table.filter(pa.compute.equal(table["episode_index"], 2))
+        for name, column in (("action", "action"), ("state", "observation.state")):
+            assert np.transpose(motion[name]["values"]).tolist() == of_episode[column].to_pylist()
+        place = table.column_names.index("action")
+
+        def answer(*values: Any) -> Any:
+            column = pa.array(list(islice(cycle(values), len(table))))
+            parquet.write_table(table.set_column(place, "action", column), file)
+            return get("/0/episodes/2")
+
+        told = failure(answer([1.0], [1.0, 2.0]), 500)
+        assert "file-000.parquet: action: expected as many numbers in each row" in told
+        assert answer(1.0, 2.0).json()["motion"] == {"state": motion["state"]}
 
 
 def rlds(folder: Path) -> Path:

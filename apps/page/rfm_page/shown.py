@@ -176,7 +176,7 @@ class ShownDataset:
         return found
 
     def curves(self, number: int, labels: str | None) -> dict[str, Any]:
-        """Return an episode's curves over time."""
+        """Return an episode's curves over time, and its action and state as [D][T]."""
         episode, file = self._episode(number), self._labels(labels)
         times_s = self.times_s(episode)
         times_s = times_s - times_s[0]
@@ -188,6 +188,10 @@ class ShownDataset:
             "task": episode.task,
             "times_s": times_s.tolist(),
             "curves": [] if found is None else _curves(found, len(times_s)),
+            "motion": {
+                name: {"names": motion.names, "values": motion.values.T.tolist()}
+                for name, motion in self.dataset.motion(episode).items()
+            },
         }
 
     def video(self, number: int, camera: int, take: Callable[[int], object]) -> bytes:

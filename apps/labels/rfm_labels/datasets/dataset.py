@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
+import numpy.typing as npt
 
 from rfm_client import RewardError, Trajectory, UInt8Array
 from rfm_client.frames import ChannelOrder, Correction, Orientation
@@ -141,6 +142,18 @@ class DatasetEpisode:
         tasks = self.tasks or ((0, self.task),)
         ends = [*(first for first, _ in tasks[1:]), self.num_frames]
         return [(task, end - first) for (first, task), end in zip(tasks, ends, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What a robot did or was told to do.
+
+    names: of the D dimensions
+    values: float64 [T, D]
+    """
+
+    names: Sequence[str]
+    values: npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -312,6 +325,10 @@ class Dataset(ABC):
     def times_s(self, episode: DatasetEpisode) -> Times | None:
         """Return frame times from the episode's start, float64 [T]; None: unknown. Raises DatasetError."""
         return None
+
+    def motion(self, episode: DatasetEpisode) -> Mapping[str, Motion]:
+        """Return the recorded ``action`` and ``state``, as far as the dataset has them. Raises DatasetError."""
+        return {}
 
     def unused_files(self) -> Sequence[Path]:
         """Return files with rows or frames that no episode uses, relative to ``root``; empty for most layouts."""

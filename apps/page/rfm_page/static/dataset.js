@@ -8,7 +8,7 @@ import { deadLink, downloading, failure, noDataset, noEpisode, noHit, noVideo } 
 import { episodesJson, episodesText, lerobotWords } from "./exports.js";
 import { Histogram } from "./histogram.js";
 import { onKeys } from "./keys.js";
-import { DASHES, namedLine } from "./looks.js";
+import { DASHES, lookOf, namedLine } from "./looks.js";
 import { Previews } from "./previews.js";
 import { Place } from "./states.js";
 import { save } from "./takeaway.js";
@@ -72,8 +72,8 @@ export class DatasetTab {
       onChoose: () => this.#showChosen(),
     });
     const elements = {
-      videos: page["episode-videos"], chart: page["episode-chart"], slider: page["episode-time"], button: page["episode-play"],
-      told: page["episode-time-told"],
+      videos: page["episode-videos"], chart: page["episode-chart"], motion: page["motion-chart"], slider: page["episode-time"],
+      button: page["episode-play"], told: page["episode-time-told"],
     };
     this.#timeline = new Timeline(elements, { onThreshold: (value) => { this.#cutAt(value); this.#onShown(false); } });
     this.#listen();
@@ -495,16 +495,20 @@ export class DatasetTab {
 
   async #fetch({ episode }, signal) {
     const { cameras, unused, corrections } = this.#told;
-    const other = this.#page.others.value;
+    const page = this.#page;
+    const other = page.others.value;
     const names = [this.#labels, ...(other ? [other] : [])];
     await this.#download(episode, signal);
     if (this.#told.is_on_hub) this.#table.refill(episode); // also after a download that went on without the page
     const told = await Promise.all(names.map((name) => curvesOf(this.#number, episode, name, signal)));
     const curves = [...curvesIn(told[0], null), ...told.slice(1).flatMap((each) => curvesIn(each, other).slice(0, 1))];
     this.#timeline.time = 0;
-    this.#timeline.show(curves.length ? curves : [emptyCurve(told[0])]);
-    this.#page["episode-chart"].setAttribute("aria-label", describe(curves));
-    this.#page["episode-legend"].replaceChildren(...curves.map(namedLine));
+    const motion = motionIn(told[0]);
+    page.motion.hidden = !motion.length;
+    page["motion-legend"].replaceChildren(...new Map(motion.map((curve) => [curve.label, namedLine(curve)])).values());
+    this.#timeline.show(curves.length ? curves : [emptyCurve(told[0])], motion);
+    page["episode-chart"].setAttribute("aria-label", describe(curves));
+    page["episode-legend"].replaceChildren(...curves.map(namedLine));
     const blobs = await Promise.all(cameras.map((_, camera) => videoOf(this.#number, episode, camera, signal)));
     if (signal.aborted) return;
     if (!cameras.length) this.#places.episode.show(noVideo(() => this.#watch(this.#watched)));
@@ -541,6 +545,14 @@ function curvesIn({ times_s: times, curves }, file) {
     const label = file === null ? name : `${name} (${reward(file)})`;
     return { index, label, progress, success: success ?? none, answered, times, allTimes: times, dash: file === null ? null : DASHES[1] };
   });
+}
+
+/** The robot's actions and states as a chart takes them: dimensions of one name have one colour. */
+function motionIn({ times_s: times, motion }) {
+  const names = [...new Set(Object.values(motion).flatMap(({ names: own }) => own))];
+  const success = times.map(() => null);
+  return Object.entries(motion).flatMap(([leading, { names: own, values }]) => values.map((each, place) => (
+    { ...lookOf(names.indexOf(own[place])), label: own[place], leading, [leading]: each, success, times, allTimes: times })));
 }
 
 /** A curve without a number, so that there is a time to move in. */
