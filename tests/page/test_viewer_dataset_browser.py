@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from selenium.webdriver.support.select import Select
 from browsers import Browser
 from gateways import running
 from labelling import BrightnessScorer
+from paths import ROOT
 from rfm_client import RewardClient
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset, summarise
 from rfm_labels.datasets import LeRobotDataset
@@ -30,9 +32,10 @@ from viewer_requests import run_line
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
+TASK = "put the red block in the bowl"  # of the clips
 OTHER = "brightness"  # the second reward of the first dataset
 NUM_LARGE = 10_000
-DEMO, PLAIN, BRIGHT, LARGE = range(4)  # labelled by the demo, not, by brightness, and by chance
+DEMO, PLAIN, BRIGHT, LARGE, CLIPS = range(5)  # labelled by the demo, not, by brightness, by chance, and by the demo
 VIDEOS = "#episode-videos video"
 PLAYERS = f"{VIDEOS}, #episode-time"  # the videos, then the slider
 BEYOND = """
@@ -123,7 +126,11 @@ def folders(demo_server: Endpoints, tmp_path_factory: pytest.TempPathFactory) ->
     label(open_dataset(demo), BrightnessScorer(), LabelOptions(name=OTHER))
     corrected = open_dataset(bright, orient={"wrist": "rotate180"}, channels={"wrist": "bgr"})
     label(corrected, BrightnessScorer(), LabelOptions())
-    return demo, copied("toy_v21", folder / "plain"), bright, large(folder / "large", NUM_LARGE)
+    clips = folder / "clips"
+    shutil.copytree(ROOT / "apps" / "page" / "rfm_page" / "examples", clips)
+    with RewardClient(demo_server.grpc_url) as client:
+        label(open_dataset(clips, task=TASK), ClientScorer(client), LabelOptions())
+    return demo, copied("toy_v21", folder / "plain"), bright, large(folder / "large", NUM_LARGE), clips
 
 
 @pytest.fixture(scope="module")
@@ -407,6 +414,24 @@ def test_an_episode_is_scored_as_it_was_for_the_labels_and_one_without_labels_to
     page.at_rest(1)
     assert page.numbers == []
     page.score_episode()
+
+
+def test_an_episode_of_a_folder_of_videos_is_scored_as_it_was_for_the_labels(page: Page) -> None:
+    browser, root = page.browser, page.folders[CLIPS]
+    page.open_link("#tab=dataset&dataset=clips&episode=1")
+    browser.until("!document.getElementById('score-episode').disabled")
+    assert browser["episode-told"].text == f"rewound.mp4: {TASK}"
+    browser["score-episode"].click()
+    browser.until_text("scored", "1 of 1 scored")
+    columns = columns_of(root, 1)
+    (row,) = browser.cells("#curves tr")
+    assert (row[1], row[4]) == (TASK, f"{len(columns['index'])} of {len(columns['index'])}")
+    assert [float(text) for text in row[5:7]] == pytest.approx(
+        [columns[name][-1] for name in ("progress_sparse", "success")], abs=2 * SHOWN
+    )
+    run_line(root.parent, browser["command"].text)
+    again = columns_of(root.parent / "clips_episode_1", 1)
+    np.testing.assert_allclose(again["progress_sparse"], columns["progress_sparse"], rtol=0, atol=TOLERANCE)
 
 
 IN_VIEW = """

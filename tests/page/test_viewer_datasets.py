@@ -206,23 +206,34 @@ def folder_of_videos(folder: Path) -> Path:
     return folder / "videos"
 
 
+def folder_of_old_videos(folder: Path) -> Path:
+    """In a codec that no browser shows."""
+    for file in folder_of_videos(folder).iterdir():
+        encoded_anew(file, "mpeg4", {"q": "1"})
+    return folder / "videos"
+
+
 def folder_of_hdf5(folder: Path) -> Path:
     return hdf5(folder).parent
 
 
 @pytest.mark.parametrize(
-    "make", [rlds, with_pictures_in_tables, hdf5, folder_of_hdf5, folder_of_videos, by_pattern, by_reader]
+    "make",
+    [
+        *(rlds, with_pictures_in_tables, hdf5, folder_of_hdf5),
+        *(folder_of_videos, folder_of_old_videos, by_pattern, by_reader),
+    ],
 )
-def test_pictures_are_shown_as_a_video(tmp_path: Path, make: Callable[[Path], Path | str]) -> None:
+def test_an_episode_of_any_dataset_is_shown_as_a_video(tmp_path: Path, make: Callable[[Path], Path | str]) -> None:
     root = make(tmp_path)
     (dataset,) = open_to_show(str(root))
-    fps = 5 if make is folder_of_videos else 10
+    fps, how = (5, "stored") if make is folder_of_videos else (10, "encoded")
     number, camera = dataset.numbers[1], len(dataset.cameras) - 1
     with serving(root) as get:
         table, curves = get("/0").json(), get(f"/0/episodes/{number}").json()
         video = get(f"/0/episodes/{number}/videos/{camera}")
         faults = get("/0/faults").json()
-    assert (table["cameras"], table["has_stored_pixels"]) == ([*dataset.cameras], False)
+    assert (table["cameras"], video.headers["X-Frames"]) == ([*dataset.cameras], how)
     assert table["left_out"] == dataset.left_out
     assert [row["task"] for row in table["episodes"]] == [episode.task for episode in dataset.episodes]
     assert (curves["curves"], faults) == ([], {})
@@ -513,6 +524,28 @@ def test_labels_that_come_or_change_are_shown_at_once(tmp_path: Path) -> None:
         by_name = get("/0/episodes/5?labels=reward_signals/later.parquet").json()["curves"]
         columns = columns_of(root, 5, "reward_signals/later.parquet")
         np.testing.assert_array_equal(np.float32(by_name[0]["progress"]), columns["reward.later.progress"])
+
+
+def test_names_and_tasks_are_shown_as_they_are_now_and_labels_follow_the_names(tmp_path: Path) -> None:
+    root, given = folder_of_videos(tmp_path), "push the block"
+
+    def rows() -> dict[str, Any]:
+        return {row["name"]: row for row in get("/0").json()["episodes"]}
+
+    with serving(root) as get:
+        assert {name: row["task"] for name, row in rows().items()} == {"0.mp4": "", "1.mp4": ""}
+        (root / "tasks.csv").write_text("video,task\n1.mp4,open the drawer\n0.mp4,close it\n")
+        assert {name: row["task"] for name, row in rows().items()} == {"0.mp4": "close it", "1.mp4": "open the drawer"}
+        (first, *_) = label(open_dataset(root), BrightnessScorer(), LabelOptions()).files  # in the table's order
+        for number, name in enumerate(("1.mp4", "0.mp4")):
+            progress = columns_of(root, number, first.name)["progress_sparse"]
+            assert rows()[name]["final_progress"] == pytest.approx(float(progress[-1]))
+            for part, points in (("", "curves"), ("/preview", "progress")):
+                told = get(f"/0/episodes/{rows()[name]['episode']}{part}").json()[points]
+                assert (told if part else told[0]["progress"]) == pytest.approx(progress.tolist())
+        overridden = open_dataset(root, task=given, override_task=True)
+        label(overridden, BrightnessScorer(), LabelOptions(overwrite=True))
+        assert {row["task"] for row in rows().values()} == {given}
 
 
 def test_labels_of_others_may_lack_success_and_rows_and_tell_which_frames_the_model_skipped(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from rfm_client.frames import ChannelOrder, Correction, Orientation
 from rfm_client.options import ConfigError, is_blank
 from rfm_labels.datasets.faults import DatasetError, FaultsError, MissingTaskError, UnusedTaskError, require
 from rfm_labels.datasets.hub import DownloadSize
-from rfm_labels.datasets.stored_files import Times
+from rfm_labels.datasets.stored_files import Span, Times
 
 LEAST_SIZE_PX = 8  # per side; a smaller numeric array is no picture
 _WORDS = frozenset(
@@ -324,6 +324,10 @@ class Dataset(ABC):
 
     def times_s(self, episode: DatasetEpisode) -> Times | None:
         """Return frame times from the episode's start, float64 [T]; None: unknown. Raises DatasetError."""
+        return None
+
+    def span(self, episode: DatasetEpisode, camera: str) -> Span | None:
+        """Return the episode's frames in the camera's video; None: they are in no video. Raises DatasetError."""
         return None
 
     def motion(self, episode: DatasetEpisode) -> Mapping[str, Motion]:

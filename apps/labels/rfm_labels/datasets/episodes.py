@@ -120,13 +120,15 @@ class _VideoFile(Stored):
     def identity(self) -> str:
         return file_identity(self._file)
 
-    def frames(self) -> Iterator[UInt8Array]:
+    def span(self) -> Span:
         video = self._opened(self._file)
         with faults_at(self._file):
             times_s = video.packets.times_s
         gaps_s = times_s[1:] - times_s[:-1]
-        tolerance_s = 0.5 * float(gaps_s.min()) if len(gaps_s) else 0.5
-        return Span(video, times_s, tolerance_s, self._where).frames()
+        return Span(video, times_s, 0.5 * float(gaps_s.min()) if len(gaps_s) else 0.5, self._where)
+
+    def frames(self) -> Iterator[UInt8Array]:
+        return self.span().frames()
 
 
 class _Pictures(Stored):

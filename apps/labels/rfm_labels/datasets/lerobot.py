@@ -199,8 +199,9 @@ class LeRobotDataset(Dataset):
             check_pictures(self._images(episode, camera), self.place(episode, camera))
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        if camera in self.info.videos:
-            return self.span(episode, camera).frames()
+        span = self.span(episode, camera)
+        if span is not None:
+            return span.frames()
         return picture_frames(self._images(episode, camera), self.place(episode, camera))
 
     def times_s(self, episode: DatasetEpisode) -> Times:
@@ -223,8 +224,9 @@ class LeRobotDataset(Dataset):
             found[name] = Motion(names if len(names) == len(usual) else usual, values)
         return found
 
-    def span(self, episode: DatasetEpisode, camera: str) -> Span:
-        """Return the episode's frames in the camera's video. Raises DatasetError if a row has no frame of its own."""
+    def span(self, episode: DatasetEpisode, camera: str) -> Span | None:
+        if camera not in self.info.videos:
+            return None
         rows, frames = self._frames_of(episode, camera)
         tolerance_s = 0.5 * rows.apart_s(frames)
         return Span(rows.video, rows.video.packets.times_s[frames], tolerance_s, self.place(episode, camera))

@@ -3,7 +3,7 @@
 
 import { curvesOf, datasets, episodesOf, faultsOf, missingOf, previewOf, videoOf } from "./api.js";
 import { Asking } from "./asking.js";
-import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, UNDONE, WORST_FIRST } from "./episodes.js";
+import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, toldOf, UNDONE, WORST_FIRST } from "./episodes.js";
 import { deadLink, downloading, failure, noDataset, noEpisode, noHit, noVideo } from "./faults.js";
 import { episodesJson, episodesText, lerobotWords } from "./exports.js";
 import { Histogram } from "./histogram.js";
@@ -20,7 +20,6 @@ const MOST_LETTERS = 400; // that are shown of words for LeRobot: thousands of n
 const NARROW = "(max-width: 719px)";
 const NOTHING = {
   episodes: [], cameras: [], unused: [], corrections: [], left_out: {}, threshold: 0.5, provenance: null, written_s: null,
-  has_stored_pixels: true,
 };
 
 export class DatasetTab {
@@ -466,7 +465,7 @@ export class DatasetTab {
     page.datasets.classList.add("watching");
     this.#table.mark(episode.episode, this.#shown);
     page["episode-title"].textContent = `Episode ${episode.episode}`;
-    page["episode-told"].textContent = page["episode-told"].title = episode.task;
+    page["episode-told"].textContent = page["episode-told"].title = toldOf(episode);
     const place = this.#shown.findIndex((each) => each.episode === episode.episode);
     page["episode-before"].disabled = place <= 0;
     page["episode-after"].disabled = place < 0 || place === this.#shown.length - 1;
@@ -509,29 +508,31 @@ export class DatasetTab {
     this.#timeline.show(curves.length ? curves : [emptyCurve(told[0])], motion);
     page["episode-chart"].setAttribute("aria-label", describe(curves));
     page["episode-legend"].replaceChildren(...curves.map(namedLine));
-    const blobs = await Promise.all(cameras.map((_, camera) => videoOf(this.#number, episode, camera, signal)));
+    this.#watched.fps = told[0].fps;
+    const found = await Promise.all(cameras.map((_, camera) => videoOf(this.#number, episode, camera, signal)));
     if (signal.aborted) return;
     if (!cameras.length) this.#places.episode.show(noVideo(() => this.#watch(this.#watched)));
     const name = this.#datasets[this.#number].name.replace("/", "_"); // of the Hub
     cameras.forEach((camera, index) => {
       const file = `${name}_episode_${`${episode}`.padStart(6, "0")}.${short(camera)}.mp4`;
-      this.#watched.files.push(new File([blobs[index]], file, { type: blobs[index].type }));
+      this.#watched.files.push(new File([found[index].blob], file, { type: found[index].blob.type }));
       const title = unused[index] ? `${short(camera)} (${unused[index]}: not scored)` : short(camera);
       const video = this.#timeline.videos.add(this.#watched.files.at(-1), title, corrections[index]);
       this.#timeline.videos.mark(video, curves.find(({ label }) => label === short(camera)));
     });
-    const reason = !this.#told.has_stored_pixels
-      ? "Off: the page encodes these frames for the browser, which changes their scores slightly. Use rfm-client label."
-      : unused.every(Boolean) ? "Off: no camera of this episode has colours" : ""; // of no camera, too
+    const reason = unused.every(Boolean) ? "Off: no camera of this episode has colours" // of no camera, too
+      : found.some(({ isStored }, index) => !isStored && !unused[index])
+        ? "Off: the page encodes these frames for the browser, which changes their scores slightly. Use rfm-client label." : "";
     Object.assign(this.#page["score-episode"], { disabled: reason !== "", title: reason });
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) this.#timeline.videos.play();
   }
 
   #score() {
     this.#timeline.videos.pause();
-    const { fps, corrections, cameras, unused } = this.#told;
-    const { files, task, episode } = this.#watched;
-    const origins = cameras.map((camera) => ({ dataset: this.#datasets[this.#number].name, episode, camera, fps, task }));
+    const { corrections, cameras, unused } = this.#told;
+    const { files, fps, task, episode } = this.#watched;
+    const own = this.#told.provenance?.dataset?.task ? null : task; // else the command has to give it
+    const origins = cameras.map((camera) => ({ dataset: this.#datasets[this.#number].name, episode, camera, fps, task: own }));
     const used = (each) => each.filter((_, index) => !unused[index]);
     this.#onScore({ files: used(files), task, fps, corrections: used(corrections), origins: used(origins) });
   }
