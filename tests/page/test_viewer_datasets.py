@@ -213,6 +213,19 @@ def folder_of_old_videos(folder: Path) -> Path:
     return folder / "videos"
 
 
+def at_another_rate(folder: Path) -> str:
+    """A reader that knows the rate better than its videos do."""
+    reader = """
+from rfm_labels import Episode
+
+def episodes(folder):
+    for file in sorted(folder.glob("*.mp4")):
+        yield Episode(file.stem, {"front": file}, fps=10)
+"""
+    (folder / "my_reader.py").write_text(reader)
+    return f"{folder}/my_reader.py:episodes={folder_of_videos(folder)}"
+
+
 def folder_of_hdf5(folder: Path) -> Path:
     return hdf5(folder).parent
 
@@ -221,7 +234,7 @@ def folder_of_hdf5(folder: Path) -> Path:
     "make",
     [
         *(rlds, with_pictures_in_tables, hdf5, folder_of_hdf5),
-        *(folder_of_videos, folder_of_old_videos, by_pattern, by_reader),
+        *(folder_of_videos, folder_of_old_videos, at_another_rate, by_pattern, by_reader),
     ],
 )
 def test_an_episode_of_any_dataset_is_shown_as_a_video(tmp_path: Path, make: Callable[[Path], Path | str]) -> None:

@@ -37,7 +37,6 @@ from rfm_labels import (
     read_provenance,
     summarise,
 )
-from rfm_labels.datasets import TABLE, read_table_of_tasks
 from rfm_page.clips import cut, encoded, is_playable
 
 Read = TypeVar("Read")
@@ -91,7 +90,8 @@ class ShownDataset:
     def rate(self, episode: DatasetEpisode) -> float:
         """Return an episode's frames per second, on average."""
         times_s = self.times_s(episode)
-        return self.fps if self.dataset.fps or len(times_s) < 2 else float((len(times_s) - 1) / times_s[-1])
+        is_known = self.dataset.fps is not None or len(times_s) < 2
+        return self.fps if is_known else round(float((len(times_s) - 1) / times_s[-1]), 3)
 
     def read(self, reading: Callable[[ShownDataset], Read]) -> Read:
         """Check the dataset, then read from it. Raises HTTPException 500 with the fault of a broken dataset."""
@@ -119,7 +119,7 @@ class ShownDataset:
         unused = self.dataset.unused_cameras(self.dataset.cameras)
         rows = {} if summary is None else dict(zip(summary.episodes.tolist(), _rows(summary), strict=True))
         provenance = None if file is None else read_provenance(file)
-        tasks = self._tasks(provenance or {})
+        given = ((provenance or {}).get("dataset") or {}).get("task") or {"text": "", "overrides": False}
         return {
             "labels": None if file is None else self._name_of(file),
             "cameras": list(self.cameras),
@@ -134,24 +134,13 @@ class ShownDataset:
                 {
                     "episode": episode.index,
                     "name": episode.own_name,
-                    "task": task,
+                    "task": given["text"] if given["overrides"] or not episode.task else episode.task,
                     "num_frames": episode.num_frames,
                     **({} if file is None else rows.get(self._number_in(file, episode.index), {})),
                 }
-                for episode, task in tasks
+                for episode in self.dataset.listing
             ],
         }
-
-    def _tasks(self, provenance: Mapping[str, Any]) -> list[tuple[DatasetEpisode, str]]:
-        """Return each episode with its task as tasks.csv has it now, or as ``label --task`` gave it."""
-        episodes, table, listed = self.dataset.listing, self.path / TABLE, dict[str, str | None]()
-        if any(episode.own_name for episode in episodes[:1]) and table.is_file():
-            listed.update(read_table_of_tasks(table, has_tasks=False))
-        given = (provenance.get("dataset") or {}).get("task") or {}
-        own = [listed.get(episode.name) or episode.task for episode in episodes]
-        is_given = [given and (given["overrides"] or not task) for task in own]
-        tasks = [given["text"] if is_used else task for task, is_used in zip(own, is_given, strict=True)]
-        return list(zip(episodes, tasks, strict=True))
 
     def missing(self, number: int) -> dict[str, Any]:
         """Return the size of what an episode needs from the Hub, null: all is here, and whether to ask before."""
@@ -207,8 +196,10 @@ class ShownDataset:
             raise HTTPException(404, f"camera: expected one of {len(self.cameras)} with videos, got {camera}")
         episode, name = self._episode(number), self.cameras[camera]
         span = self.dataset.span(episode, name)
-        if span is not None and is_playable(span):
-            return cut(span, take), True
+        if span is not None:
+            off_s = span.times_s - self.times_s(episode)
+            if np.ptp(off_s) <= 2 * span.tolerance_s and is_playable(span):  # else a reader knows another rate
+                return cut(span, take), True
         return encoded(self.dataset.whole_frames(episode, name), self.rate(episode), take), False
 
     def preview(self, number: int, labels: str | None, take: Callable[[int], object]) -> dict[str, Any]:

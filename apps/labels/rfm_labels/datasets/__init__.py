@@ -4,7 +4,7 @@
 from rfm_labels.datasets.hdf5 import Hdf5Dataset
 from rfm_labels.datasets.hdf5_contents import opened_hdf5
 from rfm_labels.datasets.lerobot import LeRobotDataset
-from rfm_labels.datasets.opening import TABLE, open_to_show, read_table_of_tasks
+from rfm_labels.datasets.opening import open_to_show
 from rfm_labels.datasets.stored_files import Span
 
-__all__ = ["TABLE", "Hdf5Dataset", "LeRobotDataset", "Span", "open_to_show", "opened_hdf5", "read_table_of_tasks"]
+__all__ = ["Hdf5Dataset", "LeRobotDataset", "Span", "open_to_show", "opened_hdf5"]

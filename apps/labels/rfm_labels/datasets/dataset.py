@@ -319,7 +319,7 @@ class Dataset(ABC):
 
     @property
     def listing(self) -> Sequence[DatasetEpisode]:
-        """Like ``episodes``, but a Hub dataset takes them from its metadata and downloads no row table."""
+        """Like ``episodes``, but with the tasks of now, and a Hub dataset downloads no row table."""
         return self.episodes
 
     def times_s(self, episode: DatasetEpisode) -> Times | None:

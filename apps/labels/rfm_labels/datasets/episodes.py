@@ -34,6 +34,7 @@ from rfm_labels.datasets.stored_files import (
     picture_frames,
     turn_mark,
 )
+from rfm_labels.datasets.tasks_table import TABLE, read_table_of_tasks
 
 Frames: TypeAlias = UInt8Array | str | Path | Sequence[str | Path] | Callable[[], Iterable[UInt8Array]]
 
@@ -265,3 +266,9 @@ class EpisodeDataset(RecordedDataset):
     def read_episode(self, number: int) -> DatasetEpisode:
         episode = super().read_episode(number)
         return replace(episode, task=" ".join(episode.task.split()))
+
+    @property
+    def listing(self) -> Sequence[DatasetEpisode]:
+        table = self.root / TABLE
+        tasks = read_table_of_tasks(table, has_tasks=False) if table.is_file() else {}
+        return [replace(each, task=tasks.get(each.name) or each.task) for each in self.episodes]

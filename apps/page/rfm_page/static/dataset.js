@@ -485,6 +485,7 @@ export class DatasetTab {
     const { size, asks } = await missingOf(this.#number, episode, signal);
     if (size === null || signal.aborted) return;
     this.#timeline.show([]);
+    this.#page.motion.hidden = true;
     if (asks) await new Promise((accept) => place.show(downloading(episode, size, accept)));
     if (signal.aborted) return;
     place.show(downloading(episode, size));
