@@ -34,6 +34,7 @@ from gateway_requests import failure
 from gateways import StandIn, inside, listening
 from labelling import LEROBOT, BrightnessScorer
 from paths import ROOT
+from pictures import turn
 from rfm_client.frames import cached_snapshot, read_video
 from rfm_client.options import ConfigError
 from rfm_labels import LabelOptions, label, open_dataset, read_episode_labels
@@ -213,6 +214,13 @@ def folder_of_old_videos(folder: Path) -> Path:
     return folder / "videos"
 
 
+def folder_of_turned_videos(folder: Path) -> Path:
+    """Recorded upside down."""
+    for file in folder_of_videos(folder).iterdir():
+        turn(file, (-1, 0, 0, -1))
+    return folder / "videos"
+
+
 def at_another_rate(folder: Path) -> str:
     """A reader that knows the rate better than its videos do."""
     reader = """
@@ -234,13 +242,14 @@ def folder_of_hdf5(folder: Path) -> Path:
     "make",
     [
         *(rlds, with_pictures_in_tables, hdf5, folder_of_hdf5),
-        *(folder_of_videos, folder_of_old_videos, at_another_rate, by_pattern, by_reader),
+        *(folder_of_videos, folder_of_old_videos, folder_of_turned_videos, at_another_rate, by_pattern, by_reader),
     ],
 )
 def test_an_episode_of_any_dataset_is_shown_as_a_video(tmp_path: Path, make: Callable[[Path], Path | str]) -> None:
     root = make(tmp_path)
     (dataset,) = open_to_show(str(root))
-    fps, how = (5, "stored") if make is folder_of_videos else (10, "encoded")
+    fps = 5 if make in (folder_of_videos, folder_of_turned_videos) else 10
+    how = "stored" if make is folder_of_videos else "encoded"
     number, camera = dataset.numbers[1], len(dataset.cameras) - 1
     with serving(root) as get:
         table, curves = get("/0").json(), get(f"/0/episodes/{number}").json()
