@@ -211,7 +211,9 @@ def test_the_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= README_LINES
 
 
-@pytest.mark.parametrize("command", [*found(ANY_COMMAND, DOCUMENTS), *found(IN_A_SCRIPT, [*DOCUMENTS, *ROOT.glob("examples/*.sh")])])
+@pytest.mark.parametrize(
+    "command", [*found(ANY_COMMAND, DOCUMENTS), *found(IN_A_SCRIPT, [*DOCUMENTS, *ROOT.glob("examples/*.sh")])]
+)
 def test_every_command_line_is_one_that_the_commands_take(command: str) -> None:
     """Parsed by the command itself, not run."""
     words = shlex.split(VARIABLE.sub("1", command.replace("\\\n", " ")))
