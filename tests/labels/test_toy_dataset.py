@@ -16,7 +16,7 @@ from in_process import rfm_app, rfm_client_app
 from paths import ROOT
 from rfm_labels import evaluate_labels, read_outcomes
 
-GUIDE = ROOT / "docs" / "guides" / "choose_a_checkpoint.md"
+GUIDE = ROOT / "docs" / "guides" / "how_good_is_it.md"
 COMMAND = re.compile(r"^ {4}((?:python|rfm|rfm-client) .*demo_output/toy(?:.*\\\n)*.*)", re.MULTILINE)
 ROW = re.compile(r"^ *(early|full) +(\d.*) \S+ *$", re.MULTILINE)  # without the rate, which differs from run to run
 
