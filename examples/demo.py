@@ -69,7 +69,7 @@ def demo(
     else:
         with stopped_by_signals(), temporary_server(repository, output / "tritonserver.log") as endpoints:
             show_clips(endpoints.grpc_url, trajectories, output / "rewards.png")
-        steps = next_steps(*steps_without_server(_short(repository), output / "success.mp4", TASK.sentence()))
+        steps = next_steps(*steps_without_server([_short(repository)], output / "success.mp4", TASK.sentence()))
     typer.echo(f"The curves are in {output / 'rewards.png'}, the clips in {output}/*.mp4.\n{steps}")
 
 
