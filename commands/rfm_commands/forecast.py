@@ -74,7 +74,7 @@ def needs(found: Found, settings: ExportConfig, num_gpus: int, cache: Path) -> I
     host = psutil.virtual_memory().available
     then = "" if free else f", then {size(serve)} to serve"
     line = f"memory: about {size(export)} to export{then}; {size(host)} are free"
-    remedy = "name a machine with more; rfm export tries it all the same"
+    remedy = "use a machine with more, or with a GPU; rfm export tries it all the same"
     yield Need(line, PLAINLY * max(export, serve), host, "memory", remedy)
     if free:
         name = f"{'GPU' if num_gpus == 1 else f'{num_gpus} GPUs'}: {torch.cuda.get_device_name(0)}"

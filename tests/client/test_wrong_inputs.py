@@ -100,7 +100,7 @@ USAGE = {
     "rfm serve repository other": ("Invalid value: expected one FOLDER, and after it -- --OPTION=VALUE, got other"),
     "rfm serve repository --log-verbose=1": (
         "No such option: --log-verbose: put options of tritonserver after --, as in rfm serve FOLDER -- "
-        "--log-verbose=VALUE"
+        "--log-verbose=VALUE, and more of an export's settings into --config"
     ),
     "rfm serve repository --http-port abc": bad("--http-port", "expected a whole number, got 'abc'"),
     "rfm serve repository --gateway-dataset nope": (

@@ -79,6 +79,7 @@ def _scored(outcome: Outcome) -> float:
     return outcome.last_progress if isinstance(outcome, ProgressResult) else outcome.preference  # type: ignore[union-attr]
 
 
+@pytest.mark.nightly
 @pytest.mark.triton
 def test_a_checkpoint_of_one_s_own_scores_a_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "160")

@@ -160,7 +160,7 @@ def test_a_start_says_what_it_takes_and_refuses_too_little_memory_before_the_dow
     with pytest.raises(ExportError) as refused:
         find_or_export(ExportConfig(checkpoint=source, num_gpus=0), cache)
     assert str(refused.value) == (
-        "memory: expected at least 38.0 GB, got 16.0 GB free; name a machine with more; rfm export tries it all the same"
+        "memory: expected at least 38.0 GB, got 16.0 GB free; use a machine with more, or with a GPU; rfm export tries it all the same"
     )
     told = re.sub(r"[\d.]+ GB are free", "N GB are free", capsys.readouterr().err)
     assert told.splitlines() == [
@@ -178,8 +178,8 @@ LARGE = Found((), {"model.safetensors": 8_900_000_000})
 REFUSED = {
     "a disk": (0, 200, {"free": 8}, r"disk of .*: expected at least 8\.9 GB, got 8\.0 GB free; make room, or set XDG"),
     "a GPU": (8, 200, {}, r"GPU memory: expected at least 8\.9 GB, got 8\.0 GB free; --weights int8 halves them, or "),
-    "memory beside a GPU": (80, 12, {}, r"memory: expected at least 17\.4 GB, got 12\.0 GB free; name a machine"),
-    "memory beside a small GPU": (10, 30, {}, r"memory: expected at least 38\.0 GB, got 30\.0 GB free; name a mach"),
+    "memory beside a GPU": (80, 12, {}, r"memory: expected at least 17\.4 GB, got 12\.0 GB free; use a machine"),
+    "memory beside a small GPU": (10, 30, {}, r"memory: expected at least 38\.0 GB, got 30\.0 GB free; use a mach"),
     "nothing": (80, 20, {}, ""),
 }
 
