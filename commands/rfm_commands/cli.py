@@ -133,8 +133,8 @@ class ServeCommand(RfmCommand):
     """``rfm serve``: an error about an unknown option says where tritonserver's options belong."""
 
     unknown_option = (
-        "put options of tritonserver after --, as in rfm serve FOLDER -- {option}=VALUE, and more of an export's settings "
-        "into --config"
+        "put options of tritonserver after --, as in rfm serve FOLDER -- {option}=VALUE, and more of an export's "
+        "settings into --config"
     )
 
 
