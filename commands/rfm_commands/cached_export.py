@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from rfm.config import ExportConfig
-from rfm.files import ADAPTER_CONFIG, NETWORK_CONFIG, WEIGHTS, WEIGHTS_INDEX, settings_digest, weights_digest
+from rfm.files import ADAPTER_CONFIG, NETWORK_CONFIG, WEIGHTS, WEIGHTS_INDEX
 from rfm.parameters import EXPORT_VERSION
 from rfm.serve.processes import ProcessGroup, how_it_ended
 from rfm.serve.repository import CONFIG_FILE, models_in
@@ -112,13 +112,14 @@ def find_or_export(settings: ExportConfig, folder: Path) -> Path:
 
 def _digest(source: str, found: Found, settings: ExportConfig, gpus: int) -> str:
     """Return digits for all that decides an export. A part on the Hub counts by its name alone."""
+    from rfm.published.hub import digests
     from rfm.published.provenance import is_folder, source_name
 
     parts = [Path(value).expanduser() for name in _PARTS if (value := getattr(settings, name)) and is_folder(value)]
     decides = {
         **vars(settings),
         "checkpoint": source_name(source),
-        "identity": [*found.identity, weights_digest(parts), settings_digest(parts, {})],
+        "identity": [found.identity, *map(digests, parts)],
         "num_gpus": gpus,
         "version": (importlib.metadata.version("rfm-triton"), EXPORT_VERSION),
     }

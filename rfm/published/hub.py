@@ -79,8 +79,15 @@ def look(source: str | Path, say: Callable[[str], object] = _log.warning) -> Fou
         return _ask(source, say, _look)
     run_config = find_run_config(folder)
     run = "" if run_config is None else run_config.read_text(errors="replace")
-    identity = weights_digest([folder]), settings_digest([folder], {RUN_CONFIG: run})
-    return Found(identity, {file.name: file.stat().st_size for file in folder.iterdir() if file.is_file()})
+    sizes = {file.name: file.stat().st_size for file in folder.iterdir() if file.is_file()}
+    return Found((*digests(folder), run), sizes)
+
+
+def digests(folder: Path) -> tuple[str, str]:
+    """Return digests of a local folder's weights and settings. Raises CheckpointError for weights that are no file."""
+    for file in folder.rglob(HUB_WEIGHTS):
+        is_there(file)
+    return weights_digest([folder]), settings_digest([folder], {})
 
 
 def missing_bytes(repo_id: str, patterns: Sequence[str], revision: str | None = None) -> int:

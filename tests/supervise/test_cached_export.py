@@ -23,6 +23,7 @@ import rfm_export
 from commands import RFM, nothing_left_behind
 from paths import ROOT
 from rfm.config import ExportConfig
+from rfm.files import CheckpointError
 from rfm.published.hub import Found
 from rfm_client import RewardClient
 from rfm_commands.cached_export import find_or_export, is_checkpoint
@@ -80,6 +81,13 @@ def test_an_export_is_kept_until_something_that_decides_it_changes(
             assert find_or_export(asked, cache) == repository
             assert capsys.readouterr().err == f"rfm: {asked.checkpoint}: served from its export {repository}\n"
     assert len(exports(cache)) == 6
+
+
+def test_a_pipe_in_the_place_of_weights_is_refused(files: Path, settings: ExportConfig, cache: Path) -> None:
+    (weights := files / "image_encoder" / "model.safetensors").unlink(missing_ok=True)
+    os.mkfifo(weights)
+    with pytest.raises(CheckpointError, match=r"image_encoder/model\.safetensors: expected a file, got a pipe"):
+        find_or_export(settings, cache)
 
 
 def test_an_interrupted_export_is_never_served(
