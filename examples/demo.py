@@ -19,6 +19,7 @@ from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, S
 from rfm_client.cli.pictures import Panel, plot
 from rfm_client.cli.scoring import heading
 from rfm_client.cli.show import PAGE_PORT, PAGE_URL, command, next_steps, score_step, scores_table
+from rfm_client.contract.description import PUBLIC_CHECKPOINT
 from rfm_client.contract.wire import DEFAULT_MODEL
 from rfm_client.frames.inputs import load_trajectory
 from rfm_commands.try_video import steps_without_server
@@ -69,7 +70,8 @@ def demo(
     else:
         with stopped_by_signals(), temporary_server(repository, output / "tritonserver.log") as endpoints:
             show_clips(endpoints.grpc_url, trajectories, output / "rewards.png")
-        steps = next_steps(*steps_without_server(_short(repository), output / "success.mp4", TASK.sentence()))
+        public = ("for your own videos, serve a public checkpoint", command("rfm", "serve", PUBLIC_CHECKPOINT))
+        steps = next_steps(*steps_without_server([_short(repository)], output / "success.mp4", TASK.sentence()), public)
     typer.echo(f"The curves are in {output / 'rewards.png'}, the clips in {output}/*.mp4.\n{steps}")
 
 

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rfm.config import ExportConfig, ServeConfig
+from rfm.config import CheckpointConfig, ExportConfig, ServeConfig
 from rfm.serve.access import NO_KEY, Endpoints, callers_restrictions, new_key, read_key, take_key
 from rfm.serve.installation import ServerStartError, find_installation, has_gpu, without_gpus
 from rfm.serve.supervisor import CrashLoopError, GatewayProcess, Supervisor
@@ -34,6 +34,7 @@ try:
     )  # before the modules below, which import it
 except ModuleNotFoundError:
     raise SystemExit("rfm: expected the package rfm-gateway, got none: pip install ./client ./apps/gateway .") from None
+from rfm_commands.cached_export import exported, is_checkpoint
 from rfm_commands.command import AdminKeyFile, RfmCommand, RfmCommands, TritonPath, fail, say, timed_steps
 from rfm_commands.config import Config, GatewayBeside, named_as_typed
 from rfm_commands.models import app as models_app
@@ -131,7 +132,10 @@ def export(
 class ServeCommand(RfmCommand):
     """``rfm serve``: an error about an unknown option says where tritonserver's options belong."""
 
-    unknown_option = "put options of tritonserver after --, as in rfm serve FOLDER -- {option}=VALUE"
+    unknown_option = (
+        "put options of tritonserver after --, as in rfm serve FOLDER -- {option}=VALUE, and more of an export's "
+        "settings into --config"
+    )
 
 
 @app.command(cls=ServeCommand)
@@ -139,11 +143,12 @@ class ServeCommand(RfmCommand):
 def serve(
     given: OptionValues[ServeConfig],
     gateway_given: OptionValues[GatewayBeside],
+    checkpoint_given: OptionValues[CheckpointConfig],
     words: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="FOLDER [-- --OPTION=VALUE...]",
-            help="Triton model repository, and more of tritonserver's options.",
+            metavar="FOLDER|CHECKPOINT [-- --OPTION=VALUE...]",
+            help="Triton model repository, or a checkpoint, and more of tritonserver's options.",
             show_default=False,
         ),
     ] = None,
@@ -167,17 +172,18 @@ def serve(
 ) -> None:
     """Run tritonserver on a model repository until a signal stops it.
 
-    With --gateway-port it also runs a gateway, and watches both.
+    A checkpoint, org/name or a folder, is exported into ~/.cache/rfm first, unless it is there. With --gateway-port it
+    also runs a gateway, and watches both.
 
     Only requests with the admin key can change its models, logging and tracing; without an admin key, no request can.
 
-    Example: rfm serve my_models --gateway-port 8100
+    Example: rfm serve org/name --gateway-port 8100
     """
     raise_limit()  # Triton and the gateway inherit it
-    folder, more_arguments = _folder_and_arguments(words or (), repository)
+    word, more_arguments = _word_and_arguments(words or ())
     if not has_gpu():
         more_arguments = [*without_gpus(more_arguments), *more_arguments]
-    config = _config(config_file, serve=given, gateway=gateway_given)
+    config = _config(config_file, serve=given, gateway=gateway_given, export=checkpoint_given)
     key_file = config.serve.api_key_file
     api_key = None if key_file is None else read_key(key_file, "--api-key-file")
     more_arguments = [*callers_restrictions(api_key, more_arguments), *more_arguments]
@@ -188,12 +194,14 @@ def serve(
     if accept_known_vulnerabilities and not config.serve.is_loopback:
         logger.warning("%s is no loopback address, and %s", config.serve.host, ACCEPTED_WARNING)
     endpoints = Endpoints.of(config.serve, config.gateway.port)
+    installation = find_installation(tritonserver)
+    folder = _served(word, repository, config.export, checkpoint_given)
     log = log_file(triton_log, endpoints.http_port, os.environ)
     with opened(log) as lines:
         server = TritonServer(
             folder,
             endpoints,
-            find_installation(tritonserver),
+            installation,
             http_threads=config.serve.http_threads,
             log=lines,
             admin_key=take_key(admin_key_file, os.environ) or new_key(),
@@ -242,15 +250,38 @@ app.command("try", cls=RfmCommand)(try_video)
 app.add_typer(models_app, name="models")
 
 
-def _folder_and_arguments(words: Sequence[str], repository: Path | None) -> tuple[Path, Sequence[str]]:
-    """Return the repository and tritonserver's arguments: typer passes words after ``--`` as words, too."""
-    folder = words[0] if words and not words[0].startswith("-") else None
-    if (folder is None) == (repository is None):
-        raise typer.BadParameter(f"give FOLDER or --repository{', not both' * (folder is not None)}")
-    arguments = words if folder is None else words[1:]
+def _word_and_arguments(words: Sequence[str]) -> tuple[str | None, Sequence[str]]:
+    """Return the word before ``--``, and tritonserver's arguments: typer passes words after ``--`` as words, too."""
+    word = words[0] if words and not words[0].startswith("-") else None
+    arguments = words if word is None else words[1:]
     if wrong := [word for word in arguments if not word.startswith("-")]:
         raise typer.BadParameter(f"expected one FOLDER, and after it -- --OPTION=VALUE, got {' '.join(wrong)}")
-    return (Path(str(folder)) if repository is None else repository), arguments
+    return word, arguments
+
+
+def _served(
+    word: str | None, repository: Path | None, settings: ExportConfig, given: OptionValues[CheckpointConfig]
+) -> Path:
+    """Return the repository to serve: the named one, or a checkpoint's export in the cache.
+
+    word: FOLDER or CHECKPOINT
+    given: options for an export, of which ``settings`` has all values
+    """
+    if word is not None and repository is not None:
+        raise typer.BadParameter("give FOLDER or --repository, not both")
+    checkpoint = given.get("checkpoint")
+    if word is not None and is_checkpoint(word):
+        if checkpoint is not None:
+            raise typer.BadParameter("give CHECKPOINT or --checkpoint, not both")
+        checkpoint = word
+    elif (folder := repository if word is None else Path(word)) is not None:
+        if given:
+            option = CheckpointConfig.settings()[next(iter(given))].option
+            raise typer.BadParameter(f"{option} decides an export, but {folder} names a repository")
+        return folder
+    if (checkpoint := checkpoint or settings.checkpoint) is None:
+        raise typer.BadParameter("give FOLDER, CHECKPOINT or --repository")
+    return exported(replace(settings, checkpoint=checkpoint))
 
 
 def _run(supervisor: Supervisor, log: Path | None) -> None:

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -16,12 +16,13 @@ from rfm_client import RewardClient, Trajectory
 from rfm_client.cli.command import OptionValues, with_options
 from rfm_client.cli.options import FrameRate
 from rfm_client.cli.show import PAGE_PORT, PAGE_URL, command, next_steps, scores_table
+from rfm_client.contract.description import PUBLIC_CHECKPOINT, ModelInfo
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.contract.wire import frames_name
+from rfm_commands.cached_export import exported
 from rfm_commands.command import TritonPath, fail
 
 REPOSITORY = Path("model_repository")
-EXPORTED = Path("my_models")  # where the user could export the checkpoint
 
 
 @with_options
@@ -43,36 +44,37 @@ def try_video(
 
         from rfm_client.frames.video import read_video
     except ImportError as error:
-        fail(f'it needs {error.name}: pip install ".[demo,encoders,triton]"')
+        fail(f'it needs {error.name}: pip install ".[demo,encoders,vlm,triton]"')
     settings = ExportConfig(**given)
-    with stopped_by_signals(), TemporaryDirectory(prefix="rfm-try-") as folder:
+    with stopped_by_signals():
         frames = read_video(video, rate.fps)
         try:
             output.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             fail(f"{output}: expected a folder that can be made, got: {error.strerror}; --output names another one")
-        served = repository
-        if settings.checkpoint is not None:
-            served = _exported_frames(settings.checkpoint, settings, Path(folder) / "model_repository")
+        served = repository if settings.checkpoint is None else _exported_frames(settings)
         with temporary_server(served, output / "tritonserver.log", tritonserver) as endpoints:
-            score_video(endpoints, video, frames, task, output / "rewards.png")
-    steps = []
-    if settings.checkpoint is not None:
-        repository = EXPORTED
-        exported = command("rfm", "export", *_words(given), "--repository", repository)
-        steps.append(("export the checkpoint", exported))
-    typer.echo(next_steps(*steps, *steps_without_server(repository, video, task)))
+            info = score_video(endpoints, video, frames, task, output / "rewards.png")
+    source = [repository] if settings.checkpoint is None else [settings.checkpoint, *_words(given)]
+    steps = steps_without_server(source, video, task)
+    if info.warning:
+        public = command("rfm", "try", video, "--task", task, "--checkpoint", PUBLIC_CHECKPOINT)
+        steps.insert(0, ("score the video with a public checkpoint", public))
+    typer.echo(next_steps(*steps))
 
 
-def steps_without_server(repository: Path, video: Path, task: str) -> list[tuple[str, str]]:
-    """Return what to try with a repository and a video: serve it with the page, score the video."""
-    served = command("rfm", "serve", repository, "--gateway-port", PAGE_PORT)
+def steps_without_server(source: Sequence[object], video: Path, task: str) -> list[tuple[str, str]]:
+    """Return what to try with a video: serve the model with the page, score the video.
+
+    source: a repository, or a checkpoint and its options
+    """
+    served = command("rfm", "serve", *source, "--gateway-port", PAGE_PORT)
     score = command("rfm-client", "score", video, "--task", task)
     return [(f"serve the model, and the page at {PAGE_URL}", served), ("in another terminal, score the video", score)]
 
 
-def score_video(endpoints: Endpoints, video: Path, frames: UInt8Array, task: str, picture: Path) -> None:
-    """Score the video, print the table, and draw the plot.
+def score_video(endpoints: Endpoints, video: Path, frames: UInt8Array, task: str, picture: Path) -> ModelInfo:
+    """Score the video, print the table, draw the plot, and describe the model.
 
     frames: uint8 [T, H, W, 3], T frames, H x W pixels, evenly thinned if the checkpoint takes fewer
     """
@@ -92,22 +94,21 @@ def score_video(endpoints: Endpoints, video: Path, frames: UInt8Array, task: str
     title = heading(task, [info])
     plot(picture, [Panel.of(video.name, result, frames, frame_times_s(video, len(frames)))], title)
     typer.echo(f"The curves are in {picture}.")
+    return info
 
 
-def _exported_frames(checkpoint: str, settings: ExportConfig, repository: Path) -> Path:
-    """Export the checkpoint and return the repository. Fails if the checkpoint scores only embeddings."""
-    import rfm_export
-
-    rfm_export.export(checkpoint, repository, settings)
+def _exported_frames(settings: ExportConfig) -> Path:
+    """Return the repository of the checkpoint's export. Fails if the checkpoint scores only embeddings."""
+    repository = exported(settings)
     if not (repository / frames_name(settings.name)).exists():
-        fail(f"{checkpoint}: expected one that scores frames, got none; name --image-encoder, --text-encoder")
+        fail(f"{settings.checkpoint}: expected one that scores frames, got none; name --image-encoder, --text-encoder")
     return repository
 
 
-def _words(given: OptionValues[Any]) -> list[str]:
-    """Return a checkpoint's options, as they stand on a command line."""
+def _words(given: OptionValues[CheckpointConfig]) -> list[str]:
+    """Return a checkpoint's options, as they stand on a command line behind the checkpoint."""
     words = []
     for name, value in given.items():
         option = CheckpointConfig.settings()[name].option
-        words += [option] if value is True else [option, str(value)]
+        words += [] if name == "checkpoint" else [option] if value is True else [option, str(value)]
     return words

@@ -21,7 +21,7 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -39,15 +39,22 @@ _log = logging.getLogger(__name__)
 
 
 @contextmanager
-def alone(repository: Path) -> Iterator[None]:
+def alone(repository: Path, wait: Callable[[], object] | None = None) -> Iterator[None]:
     """Lock the repository against other exports and rollouts, if its file system supports locks.
 
-    Removes scratch folders that killed processes left. Raises ExportError while another export or rollout runs.
+    Removes scratch folders that killed processes left. While another export or rollout runs, calls ``wait`` and waits
+    for its end; without ``wait`` raises ExportError.
     """
     _make_writable(repository)
     descriptor = os.open(repository, os.O_RDONLY)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released when the process ends, even if killed
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released when the process ends, even if killed
+        except BlockingIOError:
+            if wait is None:
+                raise
+            wait()
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
     except BlockingIOError:
         os.close(descriptor)
         raise ExportError.at(repository, "no other export or rollout at work", "one") from None

@@ -84,7 +84,7 @@ def read_for_export(
     Parameters and errors: see ``export``.
     """
     if not other_machine:
-        _check_gpus(settings.num_gpus)
+        check_gpus(settings.num_gpus)
     named = None if device is None else device_named(device)
     folder = published.find(source, say)
     kind = published.choose(folder, family, settings)
@@ -127,7 +127,7 @@ def device_named(name: str) -> torch.device:
     return torch.device(name)
 
 
-def _check_gpus(num_gpus: int | None) -> None:
+def check_gpus(num_gpus: int | None) -> None:
     """Raise ExportError for more GPUs than this machine has: Triton would refuse to load the models."""
     there = torch.cuda.device_count()
     if num_gpus is not None and num_gpus > there:

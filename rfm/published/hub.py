@@ -5,11 +5,28 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
+from typing import TypeVar
 
-from rfm.files import HUB_FILES, HUB_WEIGHTS, RUN_CONFIG, WEIGHTS, CheckpointError, cut, is_there, shown
+from rfm.files import (
+    ADAPTER_WEIGHTS,
+    HUB_FILES,
+    HUB_WEIGHTS,
+    RUN_CONFIG,
+    WEIGHTS,
+    WEIGHTS_INDEX,
+    CheckpointError,
+    cut,
+    is_there,
+    settings_digest,
+    shown,
+    weights_digest,
+)
 from rfm.published.provenance import snapshot_of
+from rfm.published.run_config import find_run_config
 from rfm.published.weights import refuse_pickles
 from rfm_client.contract.hub_access import HubError, hub_errors, unreachable
 
@@ -17,7 +34,32 @@ _log = logging.getLogger(__name__)
 _SOURCE = "a folder that exists or a Hugging Face id org/name[/subfolder][@tag]"
 _ID = re.compile(r"(?P<repo>\w[\w.-]*/\w[\w.-]*)(?:/(?P<subfolder>[\w=.+-]+(?:/[\w=.+-]+)*))?(?:@(?P<tag>.+))?")
 _COMMIT = re.compile(r"[0-9a-f]+")
+_T = TypeVar("_T")
 _BEST_TAG = re.compile(r"best-.*?-(-?\d+\.\d+)-step-\d+")
+
+
+@dataclass(frozen=True)
+class Found:
+    """A checkpoint's files before they are fetched.
+
+    identity: what changes whenever the checkpoint does: commits on the Hub, digests of a local folder's files
+    sizes: bytes of the files in the checkpoint's folder, by name
+    missing_bytes: what ``find`` will download
+    """
+
+    identity: tuple[str | None, ...]
+    sizes: Mapping[str, int]
+    missing_bytes: int = 0
+
+    @property
+    def weights_bytes(self) -> int:
+        """The size of all weights, for an adapter without its base model."""
+        return sum(size for name, size in self.sizes.items() if name.endswith(Path(HUB_WEIGHTS).suffix))
+
+    @property
+    def is_adapter(self) -> bool:
+        """True if the weights change those of a base model."""
+        return ADAPTER_WEIGHTS in self.sizes and not {WEIGHTS, WEIGHTS_INDEX} & self.sizes.keys()
 
 
 def find(source: str | Path, say: Callable[[str], object] = _log.warning) -> Path:
@@ -26,6 +68,39 @@ def find(source: str | Path, say: Callable[[str], object] = _log.warning) -> Pat
     An existing folder wins over a Hub id with the same name.
     say: receives a line about the cached revision in use if the Hub cannot be reached
     """
+    folder = _local(source)
+    return _ask(source, say, _snapshot) if folder is None else folder
+
+
+def look(source: str | Path, say: Callable[[str], object] = _log.warning) -> Found:
+    """Return what ``find`` will find, without a download. Raises CheckpointError. say: as for ``find``"""
+    folder = _local(source)
+    if folder is None:
+        return _ask(source, say, _look)
+    run_config = find_run_config(folder)
+    run = "" if run_config is None else run_config.read_text(errors="replace")
+    sizes = {file.name: file.stat().st_size for file in folder.iterdir() if file.is_file()}
+    return Found((*digests(folder), run), sizes)
+
+
+def digests(folder: Path) -> tuple[str, str]:
+    """Return digests of a local folder's weights and settings. Raises CheckpointError for weights that are no file."""
+    for file in folder.rglob(HUB_WEIGHTS):
+        is_there(file)
+    return weights_digest([folder]), settings_digest([folder], {})
+
+
+def missing_bytes(repo_id: str, patterns: Sequence[str], revision: str | None = None) -> int:
+    """Return what a download of a revision's files will take; 0 without an answer from the Hub. Raises HubError."""
+    if unreachable(repo_id, revision=revision) is not None:
+        return 0
+    with hub_errors():
+        commit, sizes = _sizes(repo_id, patterns, revision)
+    return _missing(repo_id, commit, sizes)
+
+
+def _local(source: str | Path) -> Path | None:
+    """Return the local folder; None: the source may be a Hub id. Raises CheckpointError."""
     try:
         path = Path(source).expanduser()
         if str(source) and path.is_dir():
@@ -35,10 +110,7 @@ def find(source: str | Path, say: Callable[[str], object] = _log.warning) -> Pat
     except (OSError, RuntimeError) as error:
         got = f"{shown(str(source))}: {type(error).__name__}"
         raise CheckpointError.at("checkpoint", _SOURCE, got) from error
-    match = _ID.fullmatch(str(source))
-    if match is None or ".." in Path(source).parts:
-        raise CheckpointError.at("checkpoint", _SOURCE, shown(str(source)))
-    return _fetch(match["repo"], match["subfolder"] or "", match["tag"], path, say)
+    return None
 
 
 def check_links(folder: Path) -> None:
@@ -65,19 +137,23 @@ def best_tag(tags: Iterable[str]) -> str | None:
     return max(scores, key=scores.__getitem__, default=None)
 
 
-def _fetch(repo_id: str, subfolder: str, tag: str | None, path: Path, say: Callable[[str], object]) -> Path:
-    """Fetch a checkpoint without pickles into the Hub's cache. ``path``: the local folder that does not exist."""
+def _ask(source: str | Path, say: Callable[[str], object], answer: Callable[..., _T]) -> _T:
+    """Return what ``answer`` returns for the repository, subfolder and tag of a Hub id. Raises CheckpointError."""
+    match = _ID.fullmatch(str(source))
+    if match is None or ".." in Path(source).parts:
+        raise CheckpointError.at("checkpoint", _SOURCE, shown(str(source)))
+    repo_id, subfolder, tag = match["repo"], match["subfolder"] or "", match["tag"]
     down = None
     try:
         down = unreachable(repo_id, revision=tag)
         with hub_errors():
             tag = tag or (_best_revision(repo_id) if down is None else _cached_revision(repo_id, down, say))
-            return _snapshot(repo_id, subfolder, tag, is_down=down is not None)
+            return answer(repo_id, subfolder, tag, is_down=down is not None)
     except HubError as error:
         where = repo_id if tag is None else f"{repo_id}@{tag}"
         why = str(error) if down in (None, str(error)) else f"{down}, and {error}"
         raise CheckpointError(
-            f"{where}: cannot be fetched: {cut(why)}; there is no folder {path.absolute()} either; "
+            f"{where}: cannot be fetched: {cut(why)}; there is no folder {Path(source).absolute()} either; "
             f"name one, or see to the Hub's name, login and network{_cached(repo_id, subfolder)}"
         ) from error
 
@@ -103,11 +179,7 @@ def _snapshot(repo_id: str, subfolder: str, tag: str | None, *, is_down: bool) -
     """Return a revision's folder in the Hub's cache, with all files that are read. tag: None: main."""
     from huggingface_hub import HfApi, snapshot_download
 
-    patterns, run_configs = HUB_FILES, [RUN_CONFIG]
-    if subfolder:
-        above = subfolder.rpartition("/")[0]
-        run_configs = [f"{subfolder}/{RUN_CONFIG}", f"{above}/{RUN_CONFIG}".lstrip("/")]
-        patterns = [*(f"{subfolder}/{pattern}" for pattern in HUB_FILES), run_configs[1]]
+    patterns, run_configs = _wanted(subfolder)
     snapshot = Path(snapshot_download(repo_id, revision=tag, allow_patterns=patterns, local_files_only=is_down))
     folder = snapshot / subfolder
     if not is_down and not any(folder.rglob(HUB_WEIGHTS)):
@@ -119,6 +191,51 @@ def _snapshot(repo_id: str, subfolder: str, tag: str | None, *, is_down: bool) -
     if not folder.is_dir():
         raise CheckpointError.at(f"{repo_id}@{tag or 'main'}", f"the folder {subfolder}", "none of this name")
     return folder
+
+
+def _wanted(subfolder: str) -> tuple[list[str], list[str]]:
+    """Return patterns for the files that are read, and where the run's config.yaml may be."""
+    if not subfolder:
+        return HUB_FILES, [RUN_CONFIG]
+    above = subfolder.rpartition("/")[0]
+    run_configs = [f"{subfolder}/{RUN_CONFIG}", f"{above}/{RUN_CONFIG}".lstrip("/")]
+    return [*(f"{subfolder}/{pattern}" for pattern in HUB_FILES), run_configs[1]], run_configs
+
+
+def _look(repo_id: str, subfolder: str, tag: str | None, *, is_down: bool) -> Found:
+    """Return what ``_snapshot`` will find."""
+    from huggingface_hub import HfApi, snapshot_download
+
+    patterns, run_configs = _wanted(subfolder)
+    if is_down:
+        snapshot = Path(snapshot_download(repo_id, revision=tag, local_files_only=True))
+        files = [file for file in snapshot.rglob("*") if file.is_file()]
+        commit, sizes = snapshot.name, {str(file.relative_to(snapshot)): file.stat().st_size for file in files}
+    else:
+        commit, sizes = _sizes(repo_id, patterns, tag)
+    run_commit = None
+    if sizes.keys().isdisjoint(run_configs):  # then main has it
+        cached = _snapshots(repo_id).get("main")
+        run_commit = HfApi().model_info(repo_id).sha if not is_down else None if cached is None else cached.name
+    of_folder = {Path(name).name: size for name, size in sizes.items() if Path(name).parent == Path(subfolder)}
+    return Found((commit, run_commit), of_folder, 0 if is_down else _missing(repo_id, commit, sizes))
+
+
+def _sizes(repo_id: str, patterns: Sequence[str], revision: str | None = None) -> tuple[str, dict[str, int]]:
+    """Return a revision's commit, and the size of each file that fits a pattern."""
+    from huggingface_hub import HfApi
+
+    info = HfApi().model_info(repo_id, revision=revision, files_metadata=True)
+    sizes = {file.rfilename: file.size or 0 for file in info.siblings or ()}
+    return str(info.sha), {name: size for name, size in sizes.items() if any(fnmatch(name, each) for each in patterns)}
+
+
+def _missing(repo_id: str, commit: str, sizes: Mapping[str, int]) -> int:
+    """Return the size of the files that the Hub's cache lacks."""
+    from huggingface_hub import try_to_load_from_cache
+
+    cached = {name for name in sizes if isinstance(try_to_load_from_cache(repo_id, name, revision=commit), str)}
+    return sum(size for name, size in sizes.items() if name not in cached)
 
 
 def _snapshots(repo_id: str) -> dict[str, Path]:

@@ -49,8 +49,7 @@ def _found(folder: Path) -> tuple[str, str]:
     if above is not None:
         return "a folder inside one", f"--repository {above}"
     if any(folder.glob(_WEIGHTS)):
-        export = _EXPORT.format(checkpoint=folder, repository="model_repository")
-        return "a checkpoint", f"{export}, then --repository model_repository"
+        return "a checkpoint", f"rfm serve {folder} exports and serves it"
     below = next((file.parent.parent for file in sorted(folder.glob(f"*/*/{CONFIG_FILE}"))), None)
     if below is not None:
         return "a folder that has one", f"--repository {below}"

@@ -94,11 +94,13 @@ USAGE = {
     f"rfm-client gateway --triton {NOBODY} --dataset nope": bad("--dataset", f"nope: {DATASET} none"),
     "rfm-client label dataset --override-task": "Invalid value: --override-task needs --task",
     "rfm score a.mp4": "No such command 'score': that is `rfm-client score`",
-    "rfm serve": "Invalid value: give FOLDER or --repository",
+    "rfm serve": "Invalid value: give FOLDER, CHECKPOINT or --repository",
+    "rfm serve repository --as topreward": ("Invalid value: --as decides an export, but repository names a repository"),
+    "rfm serve org/name --checkpoint org/other": "Invalid value: give CHECKPOINT or --checkpoint, not both",
     "rfm serve repository other": ("Invalid value: expected one FOLDER, and after it -- --OPTION=VALUE, got other"),
     "rfm serve repository --log-verbose=1": (
         "No such option: --log-verbose: put options of tritonserver after --, as in rfm serve FOLDER -- "
-        "--log-verbose=VALUE"
+        "--log-verbose=VALUE, and more of an export's settings into --config"
     ),
     "rfm serve repository --http-port abc": bad("--http-port", "expected a whole number, got 'abc'"),
     "rfm serve repository --gateway-dataset nope": (

@@ -296,7 +296,7 @@ def test_a_gateway_on_a_port_of_triton_asks_triton_where_it_moved(started: Any, 
 
 
 WORDS: dict[str, tuple[str, str]] = {
-    "no folder": ("serve", "Invalid value: give FOLDER or --repository\n"),
+    "no folder": ("serve", "Invalid value: give FOLDER, CHECKPOINT or --repository\n"),
     "two folders": ("serve a --repository b", "Invalid value: give FOLDER or --repository, not both"),
     "no gateway": ("serve a --gateway-dataset=nowhere", "--gateway-dataset needs --gateway-port"),
     "two checkpoints": ("export a --checkpoint b --repository c", "give CHECKPOINT or --checkpoint, not both"),

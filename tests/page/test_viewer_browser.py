@@ -105,7 +105,7 @@ def test_dropped_clips_get_the_curves_of_the_command_line(page: Page) -> None:
     page.score("success", "failure")
     document = page.saved()
     assert [video["source"] for video in document["videos"]] == ["success.mp4", "failure.mp4"]
-    assert page.browser["warning"].text == TOY
+    assert page.browser["warning"].text == f"{TOY}; rfm serve robometer/Robometer-4B serves a public checkpoint"
     videos = by_command_line(page.videos, page.browser["command"].text)["videos"]
     for shown, video, row in zip(document["videos"], videos, page.browser.cells("#curves tr"), strict=True):
         for name in ("progress", "success", "frame_times_s"):

@@ -83,6 +83,7 @@ def _scored(outcome: Outcome) -> float:
 @pytest.mark.triton
 def test_a_checkpoint_of_one_s_own_scores_a_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     clip.write(tmp_path / "clip.mp4")
     encoders = REPOSITORY / "rfm_encoder" / "1"
     checkpoint = REPOSITORY / "rfm" / "1" / "checkpoint"
@@ -97,8 +98,9 @@ def test_a_checkpoint_of_one_s_own_scores_a_video(tmp_path: Path, monkeypatch: p
     with nothing_left_behind():
         result = rfm("try", tmp_path / "clip.mp4", *(word for pair in options.items() for word in pair))
     assert result.exit_code == 0, result.output
-    exported = f"rfm export --checkpoint {checkpoint} --image-encoder {encoders / 'image_encoder'}"
-    for shown in (TOY, clip.TASK, "clip.mp4", "32 frames", exported, "rfm serve my_models --gateway-port 8100"):
+    public = f"rfm try {tmp_path / 'clip.mp4'} --task '{clip.TASK}' --checkpoint robometer/Robometer-4B\n"
+    served = f"rfm serve {checkpoint} --image-encoder {encoders / 'image_encoder'} --text-encoder "
+    for shown in (TOY, clip.TASK, "clip.mp4", "32 frames", public, served, "text_encoder --gateway-port 8100\n"):
         assert shown in result.output
     assert (tmp_path / "rewards.png").read_bytes().startswith(PNG)
 

@@ -203,11 +203,7 @@ WRONG_FOLDERS: dict[str, tuple[str, str]] = {  # below a folder
     "a model": ("models/rfm", "a folder inside one: --repository {root}/models"),
     "a served checkpoint": ("models/rfm/1/checkpoint", "a folder inside one: --repository {root}/models"),
     "one above": ("", "a folder that has one: --repository {root}/models"),
-    "a checkpoint": (
-        "checkpoint",
-        "a checkpoint: rfm export --checkpoint {folder} --repository model_repository, "
-        "then --repository model_repository",
-    ),
+    "a checkpoint": ("checkpoint", "a checkpoint: rfm serve {folder} exports and serves it"),
 }
 
 

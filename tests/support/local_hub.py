@@ -29,6 +29,7 @@ def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") ->
 
     class Handler(Quiet, BaseHTTPRequestHandler):
         def do_GET(self) -> None:
+            self.path = self.path.partition("?")[0]
             place = "" if kind == "models" else f"/{kind}"
             words = self.path.removeprefix(f"/api/{kind}" if self.path.startswith("/api/") else place).split("/")
             repository = "/".join(words[1:3])
@@ -51,12 +52,12 @@ def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") ->
                     self._send(404, b"", {"X-Error-Code": "RevisionNotFound"})
                     return
                 folder = folders[revision]
-                names = [str(file.relative_to(folder)) for file in sorted(folder.rglob("*")) if file.is_file()]
-                siblings = [{"rfilename": name} for name in names]
+                named = {str(file.relative_to(folder)): file for file in sorted(folder.rglob("*")) if file.is_file()}
+                siblings = [{"rfilename": name, "size": file.stat().st_size} for name, file in named.items()]
                 told = {"id": repository, "sha": _commit(revisions, revision), "siblings": siblings}
                 self._send(200, json.dumps(told).encode())
             elif self.path.startswith(f"{api}/tree/"):
-                revision = self.path.removeprefix(f"{api}/tree/").partition("?")[0]
+                revision = self.path.removeprefix(f"{api}/tree/")
                 told = [_told(file, folders[revision]) for file in folders[revision].rglob("*") if file.is_file()]
                 self._send(200, json.dumps(told).encode())
             else:

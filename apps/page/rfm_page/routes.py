@@ -172,7 +172,8 @@ def _model_facts(name: str, info: ModelInfo) -> dict[str, Any]:
     rule = "all" if info.needs_whole_episode else usual
     about = {"name": name, "max_frames": info.max_frames, "rule": rule}
     about |= {"reads_views": info.reads_views, "has_success": info.has_success}
-    return {**about, "versions": list(info.versions), "source": info.source, "warning": info.warning}
+    about |= {"warning": info.warning, "remedy": info.remedy}
+    return {**about, "versions": list(info.versions), "source": info.source}
 
 
 def _frames_of(rule: Rule) -> int | str | None:

@@ -113,8 +113,8 @@ def score(
     if output.prints_tables and shown:
         print("\n" + wrapped(prefix.rule, "  ", "  "))
     infos = [outcome.info for outcome in shown]
-    for warning in dict.fromkeys(info.warning for info in infos if info.warning):
-        report(f"note: {warning}")
+    for note in dict.fromkeys(f"{info.warning}; {info.remedy}" for info in infos if info.warning):
+        report(f"note: {note}")
     output.write_json(documents.score_document(server, video, prefix, outcomes))
     title = scoring.heading(video.task, infos, output.caption)
     if output.plot is not None and shown:

@@ -17,6 +17,7 @@ from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError,
 
 DESCRIPTION_PARAMETER = "description"  # parameter in config.pbtxt
 TOY = "toy checkpoint: scores of real videos mean nothing"
+PUBLIC_CHECKPOINT = "robometer/Robometer-4B"
 _TOYS = ("7771918ab039e37c", "b26fc8fb5d62a7a2")  # weights_digest of the toy checkpoints in this repository
 _WHERE = f"parameter {DESCRIPTION_PARAMETER}"
 
@@ -166,6 +167,11 @@ class Description(Origin):
     def warning(self) -> str | None:
         """What everyone who sees a score must know; None: nothing."""
         return TOY if self.weights_digest in _TOYS else None
+
+    @property
+    def remedy(self) -> str | None:
+        """The command for scores without a ``warning``; None: there is none."""
+        return None if self.warning is None else f"rfm serve {PUBLIC_CHECKPOINT} serves a public checkpoint"
 
     @property
     def weights(self) -> str | None:

@@ -143,7 +143,7 @@ function chooseRule() {
   const model = gateway.models.find(({ name }) => name === page.model.value);
   if (model) page.rule.value = model.rule;
   page["one-view"].hidden = !model?.reads_views;
-  page.warning.textContent = model?.warning ?? "";
+  page.warning.textContent = model?.warning ? `${model.warning}; ${model.remedy}` : "";
   page.warning.hidden = !model?.warning;
   page.threshold.parentElement.hidden = model?.has_success === false;
   showLimits();
