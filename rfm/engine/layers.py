@@ -39,7 +39,7 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, relu: bool = False
     plus and the result: [..., N]
     """
     if _by_onednn(x, weight, bias):
-        onednn = torch.ops.mkldnn._linear_pointwise
+        onednn, weight = torch.ops.mkldnn._linear_pointwise, vars(weight).get("packed", weight)
         if plus is not None:
             return onednn.binary(x, plus, weight, bias, "add")
         product = onednn.default(x, weight, bias, "none", [], "")
@@ -48,6 +48,16 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, relu: bool = False
     if plus is not None:
         return product + plus
     return F.relu(product) if relu else product
+
+
+def pack(network: nn.Module) -> None:
+    """Keep a copy of each float32 matrix on the CPU in oneDNN's layout, so that no pass makes one.
+
+    The weights must not change afterwards.
+    """
+    for part in network.parameters():
+        if part.ndim == 2 and part.is_cpu and part.dtype is torch.float32 and torch.backends.mkldnn.is_available():
+            vars(part)["packed"] = torch.ops.mkldnn._reorder_linear_weight(part.detach())
 
 
 class RmsNorm(nn.Module):

@@ -19,7 +19,7 @@ import goldens
 from pretended import CUDA, pretended
 from rfm import published
 from rfm.engine import Engine
-from rfm.engine.layers import MKL_FUNCTIONS, WORTH_ONEDNN, Linear, RmsNorm, is_rms_norm, linear, speed_up
+from rfm.engine.layers import MKL_FUNCTIONS, WORTH_ONEDNN, Linear, RmsNorm, is_rms_norm, linear, pack, speed_up
 from rfm.qwen.decoder_layer import decoder_layers, turn_of
 from vlm import PLAIN, load
 
@@ -93,6 +93,19 @@ def test_nan_and_infinite_weights_give_nan_products(options: dict[str, Any]) -> 
             product = linear(torch.ones(64, 512), weight, bias, **options)
         assert product[:, 7].isnan().all()
         assert product.isnan().sum() == 64
+
+
+@pytest.mark.parametrize("options", [{}, {"relu": True}, {"plus": torch.randn(5, 7, 512)}], ids=["", "relu", "plus"])
+@pytest.mark.parametrize("count", [5, 1], ids=["large", "small"])
+def test_a_packed_weight_gives_the_same_bits(options: dict[str, Any], count: int) -> None:
+    network, x = Linear(*reversed(LARGE)), torch.randn(count, 7, LARGE[1])
+    network.weight.data[9, 3] = float("nan")
+    options = {name: value[:count] if isinstance(value, Tensor) else value for name, value in options.items()}
+    with torch.inference_mode():
+        expected = network(x, **options)
+        pack(network)
+        assert network.weight.packed.is_mkldnn
+        torch.testing.assert_close(network(x, **options), expected, rtol=0, atol=0, equal_nan=True)
 
 
 def test_speed_up_keeps_parameters_numbers_and_gradients() -> None:
