@@ -39,7 +39,9 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, relu: bool = False
     plus and the result: [..., N]
     """
     if _by_onednn(x, weight, bias):
-        onednn, weight = torch.ops.mkldnn._linear_pointwise, vars(weight).get("packed", weight)
+        onednn, (source, packed) = torch.ops.mkldnn._linear_pointwise, vars(weight).get("packed", (None, None))
+        if packed is not None and source == _source(weight):
+            weight = packed
         if plus is not None:
             return onednn.binary(x, plus, weight, bias, "add")
         product = onednn.default(x, weight, bias, "none", [], "")
@@ -51,13 +53,17 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, relu: bool = False
 
 
 def pack(network: nn.Module) -> None:
-    """Keep a copy of each float32 matrix on the CPU in oneDNN's layout, so that no pass makes one.
+    """Keep a copy of each float32 matrix on the CPU in oneDNN's layout, used until the matrix changes.
 
-    The weights must not change afterwards.
+    Otherwise each product makes that copy.
     """
     for part in network.parameters():
         if part.ndim == 2 and part.is_cpu and part.dtype is torch.float32 and torch.backends.mkldnn.is_available():
-            vars(part)["packed"] = torch.ops.mkldnn._reorder_linear_weight(part.detach())
+            vars(part)["packed"] = _source(part), torch.ops.mkldnn._reorder_linear_weight(part.detach())
+
+
+def _source(weight: Tensor) -> tuple[int, int]:
+    return weight.data_ptr(), weight._version
 
 
 class RmsNorm(nn.Module):
@@ -153,23 +159,9 @@ def as_tensor(array: npt.NDArray[Any]) -> Tensor:
 
 # The functions that PyTorch computes with MKL on a CPU: IMPLEMENT_VML_MKL in its ATen/cpu/vml.h.
 MKL_FUNCTIONS = (
-    torch.acos,
-    torch.asin,
-    torch.atan,
-    torch.cos,
-    torch.erf,
-    torch.erfc,
-    torch.erfinv,
-    torch.exp,
-    torch.log,
-    torch.log10,
-    torch.log2,
-    torch.sin,
-    torch.sqrt,
-    torch.tan,
-    torch.tanh,
-    torch.trunc,
-)
+    torch.acos, torch.asin, torch.atan, torch.cos, torch.erf, torch.erfc, torch.erfinv, torch.exp, torch.log,
+    torch.log10, torch.log2, torch.sin, torch.sqrt, torch.tan, torch.tanh, torch.trunc,
+)  # fmt: skip
 
 
 def keep_float32() -> None:

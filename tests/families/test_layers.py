@@ -57,12 +57,13 @@ def test_parts_of_a_weight_and_of_a_bias_and_views_of_an_input() -> None:
 
 
 class Operators(TorchDispatchMode):
-    """Records the calls of oneDNN's operator."""
+    """Records the calls of oneDNN's operator, and whether with a packed weight."""
 
-    by_onednn = False
+    by_onednn = by_packed = False
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         self.by_onednn |= func.namespace == "mkldnn"
+        self.by_packed |= any(isinstance(each, Tensor) and each.is_mkldnn for each in args)
         return func(*args, **(kwargs or {}))
 
 
@@ -104,8 +105,11 @@ def test_a_packed_weight_gives_the_same_bits(options: dict[str, Any], count: int
     with torch.inference_mode():
         expected = network(x, **options)
         pack(network)
-        assert network.weight.packed.is_mkldnn
-        torch.testing.assert_close(network(x, **options), expected, rtol=0, atol=0, equal_nan=True)
+        with Operators() as operators:
+            torch.testing.assert_close(network(x, **options), expected, rtol=0, atol=0, equal_nan=True)
+        assert operators.by_packed == (count == 5)
+        network.weight.zero_()
+        assert network(x).equal(network.bias.expand(count, 7, -1))
 
 
 def test_speed_up_keeps_parameters_numbers_and_gradients() -> None:
