@@ -40,8 +40,7 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, relu: bool = False
     """
     if _by_onednn(x, weight, bias):
         onednn, (source, packed) = torch.ops.mkldnn._linear_pointwise, vars(weight).get("packed", (None, None))
-        if packed is not None and source == _source(weight):
-            weight = packed
+        weight = packed if source and source == _source(weight) else weight
         if plus is not None:
             return onednn.binary(x, plus, weight, bias, "add")
         product = onednn.default(x, weight, bias, "none", [], "")
@@ -53,10 +52,7 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, relu: bool = False
 
 
 def pack(network: nn.Module) -> None:
-    """Keep a copy of each float32 matrix on the CPU in oneDNN's layout, used until the matrix changes.
-
-    Otherwise each product makes that copy.
-    """
+    """Copy float32 matrices on the CPU to oneDNN's layout, once instead of in each product, until they change."""
     for part in network.parameters():
         if part.ndim == 2 and part.is_cpu and part.dtype is torch.float32 and torch.backends.mkldnn.is_available():
             vars(part)["packed"] = _source(part), torch.ops.mkldnn._reorder_linear_weight(part.detach())
