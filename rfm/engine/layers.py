@@ -39,7 +39,8 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, relu: bool = False
     plus and the result: [..., N]
     """
     if _by_onednn(x, weight, bias):
-        onednn = torch.ops.mkldnn._linear_pointwise
+        onednn, (source, packed) = torch.ops.mkldnn._linear_pointwise, vars(weight).get("packed", (None, None))
+        weight = packed if source and source == _source(weight) else weight
         if plus is not None:
             return onednn.binary(x, plus, weight, bias, "add")
         product = onednn.default(x, weight, bias, "none", [], "")
@@ -48,6 +49,17 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, relu: bool = False
     if plus is not None:
         return product + plus
     return F.relu(product) if relu else product
+
+
+def pack(network: nn.Module) -> None:
+    """Copy float32 matrices on the CPU to oneDNN's layout, once instead of in each product, until they change."""
+    for part in network.parameters():
+        if part.ndim == 2 and part.is_cpu and part.dtype is torch.float32 and torch.backends.mkldnn.is_available():
+            vars(part)["packed"] = _source(part), torch.ops.mkldnn._reorder_linear_weight(part.detach())
+
+
+def _source(weight: Tensor) -> tuple[int, int]:
+    return weight.data_ptr(), weight._version
 
 
 class RmsNorm(nn.Module):
@@ -143,23 +155,9 @@ def as_tensor(array: npt.NDArray[Any]) -> Tensor:
 
 # The functions that PyTorch computes with MKL on a CPU: IMPLEMENT_VML_MKL in its ATen/cpu/vml.h.
 MKL_FUNCTIONS = (
-    torch.acos,
-    torch.asin,
-    torch.atan,
-    torch.cos,
-    torch.erf,
-    torch.erfc,
-    torch.erfinv,
-    torch.exp,
-    torch.log,
-    torch.log10,
-    torch.log2,
-    torch.sin,
-    torch.sqrt,
-    torch.tan,
-    torch.tanh,
-    torch.trunc,
-)
+    torch.acos, torch.asin, torch.atan, torch.cos, torch.erf, torch.erfc, torch.erfinv, torch.exp, torch.log,
+    torch.log10, torch.log2, torch.sin, torch.sqrt, torch.tan, torch.tanh, torch.trunc,
+)  # fmt: skip
 
 
 def keep_float32() -> None:

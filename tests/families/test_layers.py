@@ -19,7 +19,7 @@ import goldens
 from pretended import CUDA, pretended
 from rfm import published
 from rfm.engine import Engine
-from rfm.engine.layers import MKL_FUNCTIONS, WORTH_ONEDNN, Linear, RmsNorm, is_rms_norm, linear, speed_up
+from rfm.engine.layers import MKL_FUNCTIONS, WORTH_ONEDNN, Linear, RmsNorm, is_rms_norm, linear, pack, speed_up
 from rfm.qwen.decoder_layer import decoder_layers, turn_of
 from vlm import PLAIN, load
 
@@ -57,12 +57,13 @@ def test_parts_of_a_weight_and_of_a_bias_and_views_of_an_input() -> None:
 
 
 class Operators(TorchDispatchMode):
-    """Records the calls of oneDNN's operator."""
+    """Records the calls of oneDNN's operator, and whether with a packed weight."""
 
-    by_onednn = False
+    by_onednn = by_packed = False
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         self.by_onednn |= func.namespace == "mkldnn"
+        self.by_packed |= any(isinstance(each, Tensor) and each.is_mkldnn for each in args)
         return func(*args, **(kwargs or {}))
 
 
@@ -93,6 +94,22 @@ def test_nan_and_infinite_weights_give_nan_products(options: dict[str, Any]) -> 
             product = linear(torch.ones(64, 512), weight, bias, **options)
         assert product[:, 7].isnan().all()
         assert product.isnan().sum() == 64
+
+
+@pytest.mark.parametrize("options", [{}, {"relu": True}, {"plus": torch.randn(5, 7, 512)}], ids=["", "relu", "plus"])
+@pytest.mark.parametrize("count", [5, 1], ids=["large", "small"])
+def test_a_packed_weight_gives_the_same_bits(options: dict[str, Any], count: int) -> None:
+    network, x = Linear(*reversed(LARGE)), torch.randn(count, 7, LARGE[1])
+    network.weight.data[9, 3] = float("nan")
+    options = {name: value[:count] if isinstance(value, Tensor) else value for name, value in options.items()}
+    with torch.inference_mode():
+        expected = network(x, **options)
+        pack(network)
+        with Operators() as operators:
+            torch.testing.assert_close(network(x, **options), expected, rtol=0, atol=0, equal_nan=True)
+        assert operators.by_packed == (count == 5)
+        network.weight.zero_()
+        assert network(x).equal(network.bias.expand(count, 7, -1))
 
 
 def test_speed_up_keeps_parameters_numbers_and_gradients() -> None:

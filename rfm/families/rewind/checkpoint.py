@@ -20,7 +20,7 @@ from torch import Tensor
 from rfm.engine.execution import Execution
 from rfm.engine.family import NETWORK, config_fields
 from rfm.engine.feature_cache import FeatureCache
-from rfm.engine.layers import as_tensor
+from rfm.engine.layers import as_tensor, pack
 from rfm.engine.predictor import Predictor, RowScores, check_type, frame_scores, prefix_indices
 from rfm.families.rewind.network import RewindBatch, RewindConfig, RewindTransformer, rounded_up
 from rfm.files import NETWORK_CONFIG, WEIGHTS, expecting, read_json, read_tensors
@@ -158,6 +158,7 @@ class RewindPredictor(Predictor[RewindRow, RewindBatch]):
 
     def __init__(self, network: RewindTransformer, device: torch.device, dtype: torch.dtype = torch.float32) -> None:
         self.network = network.to(device, dtype).eval()
+        pack(self.network)
         self.device = device
         self.dtype = dtype
         self.collator = RewindCollator(network.config)

@@ -240,8 +240,7 @@ class SelfAttention(nn.Module):
     def forward(self, x: Tensor, packing: Packing) -> Tensor:
         """Attend: [P, D] -> [P, D]. No token attends to padding behind its row."""
         padded = packing.padded(linear(x, self.in_proj_weight, self.in_proj_bias))
-        parts = padded.chunk(3, dim=-1)
-        queries, keys, values = (part.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for part in parts)
+        queries, keys, values = padded.unflatten(-1, (3, self.num_heads, -1)).permute(2, 0, 3, 1, 4).unbind()
         mask = None if self.is_causal else packing.mask
         attended = F.scaled_dot_product_attention(queries, keys, values, attn_mask=mask, is_causal=self.is_causal)
         return packing.packed(attended.transpose(1, 2).flatten(2))
