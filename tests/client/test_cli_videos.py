@@ -158,7 +158,7 @@ def test_compare_asks_both_orders_of_every_two_videos_and_shows_the_scores_of_sc
         for name in ("progress", "success"):
             np.testing.assert_allclose(each[name], scored[index][name], rtol=0, atol=TOLERANCE)
         figures = [f"{figure:.4f}" for figure in (each["wins"], each["progress"][-1], each["success"][-1])]
-        assert rows(result.stdout, str(files[index]))[0][2:] == [*figures, str(len(each["progress"]))]
+        assert rows(result.stdout, str(files[index]))[0][3:] == [*figures, str(len(each["progress"]))]
     assert document["videos"][1]["frame_indices"] == np.rint(np.linspace(0, 19, 16)).astype(int).tolist()
 
 

@@ -113,8 +113,7 @@ def score(
     if output.prints_tables and shown:
         print("\n" + wrapped(prefix.rule, "  ", "  "))
     infos = [outcome.info for outcome in shown]
-    for warning in dict.fromkeys(info.warning for info in infos if info.warning):
-        report(f"note: {warning}")
+    scoring.report_warnings(infos)
     output.write_json(documents.score_document(server, video, prefix, outcomes))
     title = scoring.heading(video.task, infos, output.caption)
     if output.plot is not None and shown:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.cli.command import ExitCode, exit_code, exit_code_of, missing_package, user_message
+from rfm_client.cli.command import ExitCode, exit_code, exit_code_of, missing_package, report, user_message
 from rfm_client.cli.options import PrefixOptions, VideoOptions
 from rfm_client.cli.pictures import Panel
 from rfm_client.cli.show import Table, at_end, number, title_at_end
@@ -182,6 +182,12 @@ class SourceScorer:
         if self._gone is None and not self.client.is_ready(timeout_s=PROBE_S):
             self._gone = error
         return self._gone is not None
+
+
+def report_warnings(infos: Iterable[ModelInfo]) -> None:
+    """Report what everyone who sees these checkpoints' scores must know, once."""
+    for warning in dict.fromkeys(info.warning for info in infos if info.warning):
+        report(f"note: {warning}")
 
 
 def exit_code_of_outcomes(outcomes: Sequence[Outcome]) -> ExitCode:
