@@ -286,7 +286,8 @@ def test_a_comparison_names_no_winner_where_the_orders_disagree(
     )
     assert (comparison.ranks, comparison.ranking) == (ranks, ranking)
     of_videos, of_pairs, *legend = comparison.tables()
-    found = [re.search(r"^  \d\.npz +(\S+)", line) for line in of_videos.splitlines()]
-    assert [each[1] for each in found if each] == [str(ranks[index] or "?") for index in ranking or range(len(ranks))]
+    shown = ranking or range(len(ranks))
+    expected = [(f"{index}", f"{index + 1}", str(ranks[index] or "?")) for index in shown]
+    assert re.findall(r"^  (\d)\.npz +(\d) +(\S+)", of_videos, re.MULTILINE) == expected
     assert re.findall(r"  (agree|no answer)$", of_pairs, re.MULTILINE) == answers
     assert legend == [LEGEND] * (ranking is None)

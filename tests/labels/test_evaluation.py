@@ -265,7 +265,7 @@ def test_no_number_is_cut_on_a_terminal_and_episodes_without_an_outcome_are_left
     assert done.exit_code == 0, done.output
     shown = re.sub(r"\x1b\[\d*m", "", done.stdout)
     title = "4 episodes: 2 successes, 2 failures; 1 left out, whose outcome is unknown; "
-    title += "2 outcomes unused, of episodes without labels: 9, gone.mp4 VOC"
+    title += "2 outcomes unused, of episodes without labels: 9, gone.mp4 "
     assert title in " ".join(shown.split())
     document = json.loads((tmp_path / "out.json").read_text())
     assert (document["episodes"], document["num_without_outcome"]) == ([0, 1, 3, 4], 1)
