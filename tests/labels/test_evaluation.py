@@ -216,8 +216,8 @@ REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
         r"a\.csv: line 2: episode: expected the number or name of one episode, got '2': write 1 \(2\) or 2 \(1\)",
     ),
     "outcomes of other episodes": (
-        lambda folder: evaluate_labels([labels(folder / "a.parquet", {0: RISING})], {5: True, "a.mp4": False}),
-        "outcome: expected one that is known, got none for 1 episodes; no labels for 5, a.mp4",
+        lambda folder: evaluate_labels([labels(folder / "a", {0: RISING}, names=NAMES)], {5: True, "a.mp4": False}),
+        r"outcome: expected one that is known, got none for 1 episodes: 0 \(red_cup.mp4\); no labels for 5, a.mp4",
     ),
     "an episode twice": (
         lambda folder: read_outcomes(written(folder / "a.csv", "episode,success\n0,1\n0,0\n")),

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.options import first_names
-from rfm_labels.datasets.faults import require
-from rfm_labels.label_files import read_label_table, reward_name
+from rfm_labels.datasets.faults import DatasetError, named, require
+from rfm_labels.label_files import read_label_table, read_names, reward_name
 from rfm_labels.metadata import PROGRESS, SUCCESS
 from rfm_labels.summary import BACKWARDS_BY, voted_success
 
@@ -116,9 +116,13 @@ def evaluate_labels(files: Sequence[Path], outcomes: Mapping[Any, bool | None] |
     in_all = len(common)
     without_labels = [episode for episode in outcomes or () if episode not in everywhere]
     if outcomes is not None:
-        others = f"; no labels for {first_names(without_labels)}" if without_labels else ""
-        common = [episode for episode in common if outcomes.get(episode) is not None]
-        require("outcome", len(common) > 0, "one that is known", f"none for {in_all} episodes{others}")
+        known = [episode for episode in common if outcomes.get(episode) is not None]
+        if not known:
+            own = read_names(*files)
+            got = f"none for {in_all} episodes: {first_names([named(each, own.get(each)) for each in common])}"
+            got += f"; no labels for {first_names(without_labels)}" if without_labels else ""
+            raise DatasetError.at("outcome", "one that is known", got)
+        common = known
     is_success = None if outcomes is None else np.array([outcomes[episode] for episode in common])
     evaluations = [_evaluation(name, [read[name][each] for each in common], is_success) for name in names]
     left_out = len(everywhere) - in_all, in_all - len(common)

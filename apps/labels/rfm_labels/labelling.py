@@ -152,7 +152,9 @@ class Outputs:
     def parts_of(self, file: LabelFile) -> str:
         """Return the parts with all labels of a file, from which the run that made it writes it again; empty: none."""
         keys = {part_key(*each) for each in file.digests.items()}
-        places = [self.options.parts] if self.options.parts else sorted(map(str, self.folder.glob(".*_parts")))
+        own = f".{self.options.name}_parts"
+        there = sorted(self.folder.glob(".*_parts"), key=lambda folder: folder.name != own)  # else of an alias' run
+        places = [self.options.parts] if self.options.parts else map(str, there)
         return next((place for place in places if keys and keys <= Parts(place).keys()), "")
 
     def make_folder(self) -> None:

@@ -69,8 +69,8 @@ def evaluate(
     if not files:
         expected = "label files, NAME_progress.parquet (rfm-client label), or --labels"
         raise DatasetError.at(dataset, expected, "none")
-    names = {number: name for file in files for number, name in read_names(file).items()}
-    comparison = evaluate_labels(files, None if outcome is None else read_outcomes(outcome, dataset, names))
+    outcomes = None if outcome is None else read_outcomes(outcome, dataset, read_names(*files))
+    comparison = evaluate_labels(files, outcomes)
     if output.prints_tables:
         _print_tables(comparison)
     output.write_json(document(comparison))
