@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -40,15 +40,12 @@ def log_file(named: Path | None, http_port: int, environment: Mapping[str, str])
     return (Path(folder, "rfm") if folder else Path.home() / LOG_FOLDER) / f"triton-{http_port}.log"
 
 
-@contextmanager
-def opened(log: Path | None) -> Iterator[IO[bytes] | None]:
-    """Context manager with the file, opened for appending. Raises OSError."""
+def opened(log: Path | None) -> AbstractContextManager[IO[bytes] | None]:
+    """Return a context with the file, opened for appending. Raises OSError."""
     if log is None:
-        yield None
-        return
+        return nullcontext()
     log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("ab") as file:
-        yield file
+    return log.open("ab")
 
 
 def doors(

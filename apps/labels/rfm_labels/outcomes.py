@@ -63,10 +63,7 @@ def read_outcomes(
 
 
 def _of_csv(file: Path, names: Mapping[int, str]) -> Stored:
-    known: dict[str, set[Any]] = {}
-    for number, name in names.items():
-        for text in (name, named(number, name)):
-            known.setdefault(text, set()).add(number)
+    known = {text: number for number, name in names.items() for text in (name, named(number, name))}
     try:
         with file.open(newline="", encoding="utf-8-sig") as content:
             rows = list(csv.DictReader(content))
@@ -77,11 +74,11 @@ def _of_csv(file: Path, names: Mapping[int, str]) -> Stored:
     stored: dict[Any, tuple[str, Sequence[Any]]] = {}
     for number, row in enumerate(rows, 2):
         where, text = f"{file}: line {number}", (row[_EPISODE] or "").strip()
-        found = known.get(text, set()) | ({int(text)} if text.isdecimal() else set()) or {text}
-        either = " or ".join(named(each, names.get(each)) for each in sorted(found)) if len(found) > 1 else ""
-        got = f"{text!r}{': write ' * bool(either)}{either}"
-        require(f"{where}: {_EPISODE}", bool(text) and not either, "the number or name of one episode", got)
-        (episode,) = found
+        episode: Any = int(text) if text.isdecimal() else known.get(text, text)
+        other = known.get(text, episode)
+        either = f": write {named(other, text)} or {named(episode, names.get(episode))}" if other != episode else ""
+        is_one = bool(text) and not either
+        require(f"{where}: {_EPISODE}", is_one, "the number or name of one episode", f"{text!r}{either}")
         require(where, episode not in stored, "each episode once", f"{text} again")
         stored[episode] = f"{where}: {_SUCCESS}", [row[_SUCCESS]]
     return stored

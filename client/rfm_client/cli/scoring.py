@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import PurePath
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -31,12 +31,8 @@ from rfm_client.contract.errors import (
 from rfm_client.contract.results import FrameScores, ProgressResult
 from rfm_client.contract.samples import Trajectory
 from rfm_client.frames.sampling import Sampling
-from rfm_client.plot import Size, plot_scores
 from rfm_client.recording import Recording
 from rfm_client.scoring.samples import CallOptions
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 WORKERS = 8  # videos in memory at a time
 PROBE_S = 2.0  # timeout for checking that a server is alive
@@ -233,14 +229,3 @@ def _checkpoint(info: ModelInfo) -> str:
     source = info.source or info.name
     run = source.removesuffix("/checkpoint")  # a name, unless the folder is a version
     return source if run.isdecimal() else run
-
-
-def figure(scored: Sequence[Scored], title: str, size: Size) -> Figure:
-    """Return one figure with these sources' curves. Raises ImportError without matplotlib."""
-    return plot_scores(
-        [each.result for each in scored],
-        unique_stems([each.name for each in scored]),
-        title=title,
-        times_s=[each.times_s for each in scored],
-        size=size,
-    )
