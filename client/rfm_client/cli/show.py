@@ -160,7 +160,7 @@ def status_tables(status: ServerStatus) -> str:
         table(title, requests, counted),
         *(f"{model.name} {model.version}: {model.reason}" for model in status.models if model.reason),
         table("", batches, batched),
-        *filter(None, [status.metrics_error]),
+        *map(wrapped, filter(None, [status.metrics_error])),
     ]
     if status.devices:
         columns = ("device", "utilization", "memory used", "memory")
