@@ -250,4 +250,4 @@ def test_labels_of_a_folder_of_hdf5_files_are_listed_reported_and_deleted_togeth
     assert (done.exit_code, len(done.stdout.splitlines())) == (0, 4)
     assert labels(folder).keys() == {"a.sarm_progress.parquet", "c.sarm_progress.parquet"}
     for name in labels(folder):
-        assert f"note: {folder / name} has the same labels and stays; delete it, too, if it is an alias" in done.stderr
+        assert f"note: {folder / name} has the same labels and stays; --remove sarm deletes it" in done.stderr

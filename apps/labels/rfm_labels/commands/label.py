@@ -463,7 +463,8 @@ class LabelCommand:
         folders = dict.fromkeys(place.folder for place, _ in files)
         for path in (path for folder in folders for path in sorted(folder.glob("[!.]*.parquet"))):
             if LabelFile.read(path).digests in gone:
-                self.say(f"note: {path} has the same labels and stays; delete it, too, if it is an alias")
+                other = reward_name(path).rpartition(".")[2]
+                self.say(f"note: {path} has the same labels and stays; --remove {other} deletes it")
         if not lost:
             self.say(f"the command that made them writes them again from {', '.join(dict.fromkeys(parts.values()))}")
 
