@@ -152,9 +152,9 @@ class Outputs:
     def parts_of(self, file: LabelFile) -> str:
         """Return the parts with all labels of a file, from which the run that made it writes it again; empty: none."""
         keys = {part_key(*each) for each in file.digests.items()}
-        own = f".{self.options.name}_parts"
-        there = sorted(self.folder.glob(".*_parts"), key=lambda folder: folder.name != own)  # else of an alias' run
-        places = [self.options.parts] if self.options.parts else map(str, there)
+        own = self.folder / f".{self.options.name}_parts"  # an alias has none
+        there = map(str, sorted(self.folder.glob(".*_parts"), key=lambda folder: (folder != own, folder)))
+        places = [self.options.parts] if self.options.parts else there
         return next((place for place in places if keys and keys <= Parts(place).keys()), "")
 
     def make_folder(self) -> None:

@@ -36,8 +36,8 @@ def read_outcomes(
     and 0, or of 0 and -1; success, failure and similar words; null, NaN, an empty cell or "suboptimal" for unknown.
 
     source: a CSV file with the columns ``episode`` (a number, a name, or both as tables show them: ``0 (red_cup.mp4)``)
-        and ``success``; a LeRobot column, per frame or per episode; an
-        attribute or array of each demonstration in an HDF5 file; or a reader, ``FILE.py:FUNCTION``
+        and ``success``; a LeRobot column, per frame or per episode; an attribute or array of each demonstration in an
+        HDF5 file; or a reader, ``FILE.py:FUNCTION``
     dataset: the LeRobot folder, the HDF5 file, or the folder of the reader's recordings
     names: of the labelled episodes, by number, which a reader must give in the same order; None: unchecked
 

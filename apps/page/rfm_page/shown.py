@@ -120,10 +120,8 @@ class ShownDataset:
         rows = {} if summary is None else dict(zip(summary.episodes.tolist(), _rows(summary), strict=True))
         provenance = None if file is None else read_provenance(file)
         given = ((provenance or {}).get("dataset") or {}).get("task") or {"text": "", "overrides": False}
-        checkpoint = (provenance or {}).get("checkpoint")
-        digest = (
-            checkpoint.get("weights_digest") if isinstance(checkpoint, dict) else None
-        )  # another writer's may be text
+        checkpoint = (provenance or {}).get("checkpoint")  # of another writer, perhaps a text
+        digest = checkpoint.get("weights_digest") if isinstance(checkpoint, dict) else None
         return {
             "labels": None if file is None else self._name_of(file),
             "cameras": list(self.cameras),
