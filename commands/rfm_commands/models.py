@@ -18,7 +18,7 @@ from typing import Annotated, ClassVar
 import typer
 
 from rfm.serve.access import take_key
-from rfm.serve.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
+from rfm.serve.repository_api import RepositoryApi, RepositoryApiError
 from rfm_client.cli.command import CommandGroup, usage_errors, with_options
 from rfm_client.cli.options import CredentialFiles
 from rfm_client.contract.errors import InvalidValueError
@@ -80,7 +80,8 @@ def list_models(server: AdministeredServer) -> None:
     Example: rfm models list --admin-key-file admin.key
     """
     with server.connected() as api:
-        rows = [_row(entry) for entry in api.index()]
+        index = api.index()
+    rows = [(each.name, "" if each.version is None else str(each.version), each.state, each.reason) for each in index]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         typer.echo("  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip())
@@ -149,7 +150,3 @@ def rollback(name: ExportedName, server: AdministeredRepository) -> None:
 def _roll_out(server: AdministeredRepository, name: str, api: RepositoryApi, version: int) -> None:
     Rollout(server.repository, name, api, typer.echo).to(version)
     typer.echo(f"{name}: version {version} is served")
-
-
-def _row(entry: ModelVersion) -> tuple[str, ...]:
-    return entry.name, "" if entry.version is None else str(entry.version), entry.state, entry.reason

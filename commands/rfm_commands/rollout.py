@@ -122,7 +122,7 @@ class Rollout:
             raise
 
     def _switch(self, new: Configs, served: Mapping[str, Sequence[int]], version: int) -> None:
-        parts = [model for model, config in new.items() if not _is_ensemble(config)]
+        parts = [model for model, config in new.items() if config.platform != "ensemble"]
         for model in parts:
             self._serve(new[model], sorted({version, *served[model]}))
             probe(self.server, new[model], version)
@@ -213,10 +213,6 @@ def check_files(repository: Path, models: Mapping[str, pb.ModelConfig | None]) -
 def _dims(tensors: Iterable[Any]) -> dict[str, int]:
     """Return each tensor's last dimension, by name."""
     return {tensor.name: tensor.dims[-1] for tensor in tensors}
-
-
-def _is_ensemble(config: pb.ModelConfig) -> bool:
-    return bool(config.platform == "ensemble")
 
 
 def _words(versions: Sequence[int]) -> str:

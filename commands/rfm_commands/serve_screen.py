@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -40,15 +40,12 @@ def log_file(named: Path | None, http_port: int, environment: Mapping[str, str])
     return (Path(folder, "rfm") if folder else Path.home() / LOG_FOLDER) / f"triton-{http_port}.log"
 
 
-@contextmanager
-def opened(log: Path | None) -> Iterator[IO[bytes] | None]:
-    """Context manager with the file, opened for appending. Raises OSError."""
+def opened(log: Path | None) -> AbstractContextManager[IO[bytes] | None]:
+    """Return a context with the file, opened for appending. Raises OSError."""
     if log is None:
-        yield None
-        return
+        return nullcontext()
     log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("ab") as file:
-        yield file
+    return log.open("ab")
 
 
 def doors(
@@ -97,7 +94,7 @@ class ServeScreen:
     def show_ready(self) -> None:
         """Show the addresses, models and device, and what to try next."""
         rows = {
-            "models": f"{self._models()}, on {self._devices()}",
+            "models": self._models(),
             **{name: f"{url} ({needs})" for name, (url, needs) in self.doors.items()},
             "log": f"{self.log} (lines of Triton and the models)",
         }
@@ -109,25 +106,17 @@ class ServeScreen:
         print("\n".join(["rfm serve: " + lines[0], *lines[1:]]), file=sys.stderr, flush=True)
 
     def _models(self) -> str:
-        """Return each model with the versions that its file names."""
-        shown = []
+        """Return each model with the versions that its file names, and the GPUs that all use, or the CPU."""
+        shown, gpus = [], set[int]()
         for model in models_in(self.repository):
-            try:
-                versions = read_config(self.repository, model).version_policy.specific.versions
-            except (OSError, ParseError):  # another program's; Triton has read it
-                versions = []
-            shown.append(" ".join([model, *map(str, versions)]))
-        return ", ".join(shown)
-
-    def _devices(self) -> str:
-        """Return the GPUs that all models use, or the CPU."""
-        gpus: set[int] = set()
-        for model in models_in(self.repository):
-            try:
-                gpus.update(gpu for group in read_config(self.repository, model).instance_group for gpu in group.gpus)
-            except (OSError, ParseError):
-                continue
-        return f"GPU {', '.join(map(str, sorted(gpus)))}" if gpus else "the CPU"
+            words = [model]
+            with suppress(OSError, ParseError):  # another program's; Triton has read it
+                config = read_config(self.repository, model)
+                words += map(str, config.version_policy.specific.versions)
+                gpus.update(gpu for group in config.instance_group for gpu in group.gpus)
+            shown.append(" ".join(words))
+        device = f"GPU {', '.join(map(str, sorted(gpus)))}" if gpus else "the CPU"
+        return f"{', '.join(shown)}, on {device}"
 
     def _steps(self) -> list[tuple[str, str]]:
         here, tls = replace(self.endpoints, host=from_here(self.endpoints.host)), self.endpoints.grpc_tls

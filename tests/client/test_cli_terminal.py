@@ -70,6 +70,8 @@ def test_scores_and_figures_of_the_toy_checkpoint_say_that_they_mean_nothing(
     result = invoke("score", video, *words)
     assert (result.exit_code, result.stderr.count(f"note: {TOY}")) == (0, 1)
     assert f"<!-- {TOY} -->" in (tmp_path / "plot.svg").read_text()
+    result = invoke("compare", video, video, *words[:-2])
+    assert (result.exit_code, result.stderr.count(f"note: {TOY}")) == (0, 1)
     result = invoke("score", video, *words, "--caption", "how it went")
     drawn = (tmp_path / "plot.svg").read_text()
     assert all(f"<!-- {line} -->" in drawn for line in ("how it went", TOY))
@@ -80,7 +82,7 @@ def test_scores_and_comparisons_fit_a_terminal_and_name_each_file(engines: Engin
     assert {"video", "progress", "success", "frames", "version"} <= words
     assert {word for word in words if word.endswith(NAMES)} == set(map(str, videos))
     words, _ = shown(engines.url, "compare", *videos, "--task", TASK)
-    assert {"rank", "P(wins)", "progress", "success", "frames", "second", "mean", "orders"} <= words
+    assert {"#", "rank", "P(wins)", "progress", "success", "frames", "second", "mean", "orders"} <= words
     assert {word for word in words if word.endswith(".mp4")} == set(map(str, videos))
 
 

@@ -158,7 +158,7 @@ def test_compare_asks_both_orders_of_every_two_videos_and_shows_the_scores_of_sc
         for name in ("progress", "success"):
             np.testing.assert_allclose(each[name], scored[index][name], rtol=0, atol=TOLERANCE)
         figures = [f"{figure:.4f}" for figure in (each["wins"], each["progress"][-1], each["success"][-1])]
-        assert rows(result.stdout, str(files[index]))[0][2:] == [*figures, str(len(each["progress"]))]
+        assert rows(result.stdout, str(files[index]))[0][3:] == [*figures, str(len(each["progress"]))]
     assert document["videos"][1]["frame_indices"] == np.rint(np.linspace(0, 19, 16)).astype(int).tolist()
 
 
@@ -286,7 +286,8 @@ def test_a_comparison_names_no_winner_where_the_orders_disagree(
     )
     assert (comparison.ranks, comparison.ranking) == (ranks, ranking)
     of_videos, of_pairs, *legend = comparison.tables()
-    found = [re.search(r"^  \d\.npz +(\S+)", line) for line in of_videos.splitlines()]
-    assert [each[1] for each in found if each] == [str(ranks[index] or "?") for index in ranking or range(len(ranks))]
+    shown = ranking or range(len(ranks))
+    expected = [(f"{index}", f"{index + 1}", str(ranks[index] or "?")) for index in shown]
+    assert re.findall(r"^  (\d)\.npz +(\d) +(\S+)", of_videos, re.MULTILINE) == expected
     assert re.findall(r"  (agree|no answer)$", of_pairs, re.MULTILINE) == answers
     assert legend == [LEGEND] * (ranking is None)

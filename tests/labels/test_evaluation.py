@@ -29,13 +29,17 @@ Curves = Mapping[int, Sequence[float]]
 RISING, FALLING, FLAT = [0.0, 0.2, 0.5, 0.9], [0.9, 0.5, 0.2, 0.0], [0.3] * 4
 
 
-def labels(file: Path, progress: Curves, success: Curves | None = None) -> Path:
+NAMES = {0: "red_cup.mp4", 1: "2", 2: "1", 3: "three.mp4", 4: "blue_cup.mp4"}
+
+
+def labels(file: Path, progress: Curves, success: Curves | None = None, names: Mapping[int, str] | None = None) -> Path:
     episodes = np.concatenate([[episode] * len(values) for episode, values in progress.items()]).astype(np.int64)
     frames = np.concatenate([np.arange(len(values)) for values in progress.values()])
     columns = {"index": np.arange(len(episodes)), "episode_index": episodes, "frame_index": frames}
     scores = {"progress_sparse": progress} | ({"success": success} if success else {})
     columns |= {name: np.concatenate([*values.values()]).astype(np.float32) for name, values in scores.items()}
-    parquet.write_table(pa.table(columns), file)
+    metadata = {b"rfm.names": json.dumps(names or {}).encode()}
+    parquet.write_table(pa.table(columns).replace_schema_metadata(metadata), file)
     return file
 
 
@@ -76,6 +80,8 @@ def test_the_last_three_frames_decide_who_succeeds_and_an_undone_success_is_a_cl
         assert scores.succeeded(last=3) == (voted_success(scores.success) >= 0.5)
     done = rfm_client("label", file, "--report")
     assert done.exit_code == 0, done.output
+    never = {"episodes that succeed": "0", "episodes that succeed, then undo it": "0"}
+    assert never.items() <= dict(summarise(labels(file, {2: success[2]}, {2: success[2]})).rows()).items()
 
 
 def test_of_two_thresholds_that_are_equally_good_the_lower_counts(tmp_path: Path) -> None:
@@ -129,6 +135,12 @@ def test_outcomes_are_read_from_a_table_the_frames_or_the_episodes(tmp_path: Pat
     rows = [json.loads(line) | {"success": index % 3 == 0} for index, line in enumerate(lines.read_text().splitlines())]
     lines.write_text("\n".join(map(json.dumps, rows)))
     assert read_outcomes("success", v21) == {row["episode_index"]: row["success"] for row in rows}
+
+
+def test_a_table_of_outcomes_has_numbers_or_names_as_tables_show_them(tmp_path: Path) -> None:
+    rows = "red_cup.mp4,1\n1 (2),0\n3,1\n4 (blue_cup.mp4),0\n7,1\ngone.mp4,0\n"
+    outcomes = read_outcomes(written(tmp_path / "a.csv", f"episode,success\n{rows}"), names=NAMES)
+    assert outcomes == {0: True, 1: False, 3: True, 4: False, 7: True, "gone.mp4": False}
 
 
 def with_column(folder: Path, name: str, value: Callable[[int, bool], Any]) -> Path:
@@ -195,6 +207,18 @@ REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda folder: read_outcomes(written(folder / "a.csv", "id,ok\n0,1\n")),
         r"a\.csv: expected the columns episode and success, got id, ok",
     ),
+    "an episode twice, by number and by name": (
+        lambda folder: read_outcomes(written(folder / "a.csv", "episode,success\n0,1\nred_cup.mp4,0\n"), names=NAMES),
+        r"a\.csv: line 3: expected each episode once, got red_cup.mp4 again",
+    ),
+    "the number of one episode and the name of another": (
+        lambda folder: read_outcomes(written(folder / "a.csv", "episode,success\n2,1\n"), names=NAMES),
+        r"a\.csv: line 2: episode: expected the number or name of one episode, got '2': write 1 \(2\) or 2 \(1\)",
+    ),
+    "outcomes of other episodes": (
+        lambda folder: evaluate_labels([labels(folder / "a", {0: RISING}, names=NAMES)], {5: True, "a.mp4": False}),
+        r"outcome: expected one that is known, got none for 1 episodes: 0 \(red_cup.mp4\); no labels for 5, a.mp4",
+    ),
     "an episode twice": (
         lambda folder: read_outcomes(written(folder / "a.csv", "episode,success\n0,1\n0,0\n")),
         r"a\.csv: line 3: expected each episode once, got 0 again",
@@ -232,18 +256,24 @@ def test_no_number_is_cut_on_a_terminal_and_episodes_without_an_outcome_are_left
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     curves = {0: RISING, 1: FALLING, 2: RISING, 3: FLAT, 4: RISING}
-    files = [labels(tmp_path / f"{name}_progress.parquet", curves, curves) for name in ("a_long_name_of_a_model", "b")]
-    outcomes = written(tmp_path / "a.csv", "episode,success\n0,1\n1,0\n3,0\n4,1\n")
+    names = ("a_long_name_of_a_model", "b")
+    files = [labels(tmp_path / f"{name}_progress.parquet", curves, curves, NAMES) for name in names]
+    outcomes = written(tmp_path / "a.csv", "episode,success\n0,1\n1 (2),0\nthree.mp4,0\n4,1\n9,1\ngone.mp4,1\n")
     for name, value in {"COLUMNS": "80", "FORCE_COLOR": "1"}.items():  # as on a terminal
         monkeypatch.setenv(name, value)
     done = rfm_client("evaluate", tmp_path, "--outcome", outcomes, "--json", tmp_path / "out.json")
     assert done.exit_code == 0, done.output
     shown = re.sub(r"\x1b\[\d*m", "", done.stdout)
-    assert "4 episodes: 2 successes, 2 failures; 1 left out, whose outcome is unknown" in shown
+    title = "4 episodes: 2 successes, 2 failures; 1 left out, whose outcome is unknown; "
+    title += "2 outcomes unused, of episodes without labels: 9, gone.mp4 "
+    assert title in " ".join(shown.split())
     document = json.loads((tmp_path / "out.json").read_text())
     assert (document["episodes"], document["num_without_outcome"]) == ([0, 1, 3, 4], 1)
+    assert document["without_labels"] == [9, "gone.mp4"]
     assert max(map(len, shown.partition("VOC: ")[0].splitlines())) <= 80
-    for name, found in zip(("a_", r"b\b"), evaluate_labels(files, read_outcomes(outcomes)).evaluations, strict=True):
+    for name, found in zip(
+        ("a_", r"b\b"), evaluate_labels(files, read_outcomes(outcomes, names=NAMES)).evaluations, strict=True
+    ):
         told = re.findall(rf"(?m)^ +{name}.*(?:\n {{4}}.*)?", shown)  # a name may have a line of its own
         assert found.final_of_successes is not None and found.by_success is not None
         numbers = [found.final, found.final_of_successes, found.by_success.threshold]

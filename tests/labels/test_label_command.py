@@ -18,6 +18,7 @@ from in_process import rfm
 from labelling import FRONT, LEROBOT
 from paths import ROOT
 from rfm_client.command_line import ExitCode
+from rfm_client.contract.description import TOY
 from servers import Endpoints
 
 DATASET = LEROBOT / "toy_v30_many"
@@ -52,6 +53,7 @@ def test_both_commands_write_the_same_labels_and_print_their_decisions(demo_serv
             f"cameras: {FRONT} (asked for)",
             "sampling: rint (the checkpoint's training did not pad)",
             "frames: 8 (asked for)",
+            TOY,
             "3 of the dataset's 10 episodes have labels; LeRobot's reader gives frames of the others the weight 1.0",
         ],
     )
@@ -80,7 +82,7 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(demo_server: Endpoints, ou
     assert told["dataset"] == "LeRobot v3.0: toy_v30_many"
     assert told["episodes"] == "10"
     assert told["frames"] == "428, of 2 cameras: 856 to be decoded"
-    assert "put the blue block in the bowl" in told["tasks: 5"]
+    assert told["tasks"].startswith("5: put the blue block in the bowl")
     assert list(output.iterdir()) == []
 
 

@@ -184,11 +184,24 @@ def test_labels_are_listed_and_deleted_by_name_and_finished_episodes_stay(output
         ["other", "toy/brightness", "1", "rfm"],
         ["third", "-", "-", "-"],
     ]
-    shutil.rmtree(output / ".rfm_parts")
+    for parts in output.glob(".*_parts"):
+        shutil.rmtree(parts)
     assert "expected --yes for labels that must be scored again" in rfm_client(*remove).stderr
     assert (output / PROGRESS).exists()
     assert rfm_client(*remove, "--yes").exit_code == 0
     assert "expected labels of rfm-client, got others" in rfm_client(*remove[:-1], "third").stderr
+
+
+@pytest.mark.parametrize("name", ["sarm", "sarm_progress"])
+def test_an_alias_is_deleted_by_its_listed_name_and_by_the_one_given_to_label(output: Path, name: str) -> None:
+    labelled(TOY, output, episodes=[0], alias="sarm_progress")
+    before = labels(output)
+    wrong = rfm_client("label", TOY, "--output", output, "--remove", "nothing")
+    assert f"{output}: expected one of the labels rfm, sarm, got 'nothing'" in wrong.stderr
+    done = rfm_client("label", TOY, "--output", output, "--remove", name)
+    assert done.stdout == f"deleted {output / 'sarm_progress.parquet'}, labels of 1 episode by toy/brightness\n"
+    assert f"writes them again from {output / '.rfm_parts'}\n" in done.stderr
+    assert before.keys() - labels(output).keys() == {"sarm_progress.parquet"}
 
 
 REFUSED = {  # words after --remove, and the refusal
@@ -210,7 +223,7 @@ def test_a_removal_that_may_mean_something_else_is_refused(output: Path, words: 
     assert message in refused.stderr
 
 
-def test_labels_of_a_folder_of_hdf5_files_are_listed_and_deleted_together(tmp_path: Path) -> None:
+def test_labels_of_a_folder_of_hdf5_files_are_listed_reported_and_deleted_together(tmp_path: Path) -> None:
     folder = tmp_path / "demos"
     folder.mkdir()
     files = [write_robomimic(folder / f"{name}.hdf5", [{"front": video(4, 0)}]) for name in "abc"]
@@ -224,6 +237,9 @@ def test_labels_of_a_folder_of_hdf5_files_are_listed_and_deleted_together(tmp_pa
         ["rfm", "toy/brightness", "1", "-"],
         ["sarm", "toy/brightness", "1", "rfm"],
     ] * 2
+    told = rfm_client("label", folder, "--report")
+    assert (told.exit_code, told.stdout.count("final progress: median")) == (1, 2)
+    assert f"{folder / 'b.rfm_progress.parquet'}: expected a file of labels, got none: label" in told.stderr
     shutil.rmtree(folder / ".rfm_parts")
     before = labels(folder)
     assert (
@@ -234,4 +250,4 @@ def test_labels_of_a_folder_of_hdf5_files_are_listed_and_deleted_together(tmp_pa
     assert (done.exit_code, len(done.stdout.splitlines())) == (0, 4)
     assert labels(folder).keys() == {"a.sarm_progress.parquet", "c.sarm_progress.parquet"}
     for name in labels(folder):
-        assert f"note: {folder / name} has the same labels and stays; delete it, too, if it is an alias" in done.stderr
+        assert f"note: {folder / name} has the same labels and stays; --remove sarm deletes it" in done.stderr

@@ -23,6 +23,7 @@ from gateways import running
 from labelling import BrightnessScorer
 from paths import ROOT
 from rfm_client import RewardClient
+from rfm_client.contract.description import TOY
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset, summarise
 from rfm_labels.datasets import LeRobotDataset
 from servers import Endpoints, wait_for
@@ -276,6 +277,7 @@ def test_two_label_files_are_overlaid_and_their_differences_listed(page: Page) -
     assert sorted(page.episodes) == np.flatnonzero(differs | (apart >= 0.3)).tolist()
     tick(page, "differ")
     page.at_rest(2)
+    assert page.browser["ends-told"].text.endswith(f" Note: {TOY}.")
     page.browser["made-box"].click()
     names, texts = ([each.text for each in page.browser.all(f"#made {tag}")] for tag in ("dt", "dd"))
     told = dict(zip(names, texts, strict=True))

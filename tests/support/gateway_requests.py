@@ -222,8 +222,8 @@ def check_refused(response: requests.Response, *told: tuple[Sequence[Any], str])
 
 
 NO_KEY = (
-    "key: expected it in X-API-Key, in Authorization: Bearer, or as the password of HTTP Basic (http://any:KEY@HOST), "
-    "got another or none"
+    "key: expected it in X-API-Key, in Authorization: Bearer, or as the password of HTTP Basic "
+    "(http://any:KEY@HOST, KEY percent-encoded), got another or none"
 )
 MULTIPART = "multipart/form-data; boundary=b"
 NAMED = b'--b\r\nContent-Disposition: form-data; name="sample_0"\r\n\r\n'

@@ -30,17 +30,18 @@ from rfm_gateway.refusals import refuse
 
 _NEVER_PUBLIC = ("local", "internal", "lan", "svc")  # top-level domains that do not exist in public DNS
 _MOST_LETTERS = 100  # quoted from a header in a response
+_KEY_IN_URL = "http://any:KEY@HOST, KEY percent-encoded"
 _HEADER = APIKeyHeader(name="X-API-Key", auto_error=False)  # at module level, where FastAPI resolves annotations
 _BEARER = HTTPBearer(auto_error=False)
 _BASIC = HTTPBase(
     scheme="basic",
     scheme_name="HTTPBasic",
-    description="The key as password, with any user name: http://any:KEY@HOST.",
+    description=f"The key as password, with any user name: {_KEY_IN_URL}.",
     auto_error=False,
 )
 _EXPECTED_KEY = (
-    "key: expected it in X-API-Key, in Authorization: Bearer, or as the password of HTTP Basic (http://any:KEY@HOST), "
-    "got another or none"
+    "key: expected it in X-API-Key, in Authorization: Bearer, or as the password of HTTP Basic "
+    f"({_KEY_IN_URL}), got another or none"
 )
 _CHALLENGE = "Bearer"  # not Basic: a browser would ask its user for a password
 

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_labels.datasets.faults import require
-from rfm_labels.label_files import read_label_table, reward_name
+from rfm_client.options import first_names
+from rfm_labels.datasets.faults import DatasetError, named, require
+from rfm_labels.label_files import read_label_table, read_names, reward_name
 from rfm_labels.metadata import PROGRESS, SUCCESS
 from rfm_labels.summary import BACKWARDS_BY, voted_success
 
@@ -79,6 +80,7 @@ class LabelComparison:
     is_success: bool [E]; None: outcomes are unknown
     num_left_out: episodes that only some files have
     num_without_outcome: shared episodes left out because their outcome is unknown
+    without_labels: episodes with an outcome that no file has, by number or name
     """
 
     evaluations: Sequence[Evaluation]
@@ -86,6 +88,7 @@ class LabelComparison:
     is_success: npt.NDArray[np.bool_] | None
     num_left_out: int
     num_without_outcome: int
+    without_labels: Sequence[int | str] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,10 +99,11 @@ class _Scores:
     success: Floats | None
 
 
-def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool | None] | None = None) -> LabelComparison:
+def evaluate_labels(files: Sequence[Path], outcomes: Mapping[Any, bool | None] | None = None) -> LabelComparison:
     """Return an evaluation of label files for one dataset.
 
-    outcomes: by episode number: True for success; None, or no entry, to leave the episode out; None: unknown
+    outcomes: as ``read_outcomes`` returns them: True for success; None, or no entry, to leave the episode out; None:
+        unknown
 
     Raises DatasetError if a file is unreadable, the files share no episode, or no episode has an outcome.
     """
@@ -110,12 +114,19 @@ def evaluate_labels(files: Sequence[Path], outcomes: Mapping[int, bool | None] |
     everywhere = set.union(*(set(episodes) for episodes in read.values()))
     require("labels", len(common) > 0, "an episode that all files have", "none")
     in_all = len(common)
+    without_labels = [episode for episode in outcomes or () if episode not in everywhere]
     if outcomes is not None:
-        common = [episode for episode in common if outcomes.get(episode) is not None]
-        require("outcome", len(common) > 0, "one that is known", f"none for {in_all} episodes")
+        known = [episode for episode in common if outcomes.get(episode) is not None]
+        if not known:
+            own = read_names(*files)
+            got = f"none for {in_all} episodes: {first_names([named(each, own.get(each)) for each in common])}"
+            got += f"; no labels for {first_names(without_labels)}" if without_labels else ""
+            raise DatasetError.at("outcome", "one that is known", got)
+        common = known
     is_success = None if outcomes is None else np.array([outcomes[episode] for episode in common])
     evaluations = [_evaluation(name, [read[name][each] for each in common], is_success) for name in names]
-    return LabelComparison(evaluations, common, is_success, len(everywhere) - in_all, in_all - len(common))
+    left_out = len(everywhere) - in_all, in_all - len(common)
+    return LabelComparison(evaluations, common, is_success, *left_out, without_labels)
 
 
 def _names(files: Sequence[Path]) -> list[str]:

@@ -126,10 +126,10 @@ def read_provenance(file: Path) -> dict[str, Any]:
     return _provenance(_metadata(file))
 
 
-def read_names(file: Path) -> dict[int, str]:
-    """Read the names of a label file's episodes by number; empty for LeRobot's. Raises DatasetError."""
-    names = parsed_object(_metadata(file).get(NAMES_KEY))
-    return {int(number): str(name) for number, name in names.items()}
+def read_names(*files: Path) -> dict[int, str]:
+    """Read the names of the label files' episodes by number; empty for LeRobot's. Raises DatasetError."""
+    names = (parsed_object(_metadata(file).get(NAMES_KEY)) for file in files)
+    return {int(number): str(name) for each in names for number, name in each.items()}
 
 
 def _provenance(metadata: Mapping[bytes, bytes]) -> dict[str, Any]:

@@ -147,17 +147,15 @@ class Outputs:
     @cached_property
     def parts(self) -> Parts:
         """The finished episodes. First access creates their folder."""
-        return Parts(self.options.parts or str(self.own_parts))
+        return Parts(self.options.parts or str(self.folder / f".{self.options.name}_parts"))
 
-    @property
-    def own_parts(self) -> Path:
-        """The folder of the parts, unless another place is named."""
-        return self.folder / f".{self.options.name}_parts"
-
-    def keeps(self, file: LabelFile) -> bool:
-        """True if the parts have all labels of a file, so that the same run writes it again without scoring."""
-        keys = self.parts.keys() if self.options.parts or self.own_parts.is_dir() else set()
-        return bool(file.digests) and {part_key(*each) for each in file.digests.items()} <= keys
+    def parts_of(self, file: LabelFile) -> str:
+        """Return the parts with all labels of a file, from which the run that made it writes it again; empty: none."""
+        keys = {part_key(*each) for each in file.digests.items()}
+        own = self.folder / f".{self.options.name}_parts"  # an alias has none
+        there = map(str, sorted(self.folder.glob(".*_parts"), key=lambda folder: (folder != own, folder)))
+        places = [self.options.parts] if self.options.parts else there
+        return next((place for place in places if keys and keys <= Parts(place).keys()), "")
 
     def make_folder(self) -> None:
         """Create the folder if it is missing. Raises DatasetError if it is not writable."""
@@ -169,9 +167,10 @@ class Outputs:
             got = f"{error.strerror or error}: name another one with --output"
             raise DatasetError.at(self.folder, "a folder for the labels", got) from error
 
-    def before(self) -> list[LabelFile]:
-        """Return the existing label files."""
-        return [LabelFile.read(path) for path in (*self.progress, *self.signals) if path.exists()]
+    def before(self, alias: str = "") -> list[LabelFile]:
+        """Return the existing label files; with an alias, only its file."""
+        files = [self.folder / f"{self.prefix}{alias}.parquet"] if alias else [*self.progress, *self.signals]
+        return [LabelFile.read(path) for path in files if path.exists()]
 
     def write(self, plan: Plan, labels: Any) -> list[Path]:
         """Write the labels, a table from ``Parts.read_all``, to all files, and return their paths. Raises OSError."""

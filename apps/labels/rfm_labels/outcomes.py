@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from rfm_labels.datasets.faults import DatasetError, require
+from rfm_labels.datasets.faults import DatasetError, named, require
 from rfm_labels.datasets.hdf5 import is_hdf5
 from rfm_labels.datasets.hdf5_contents import demonstrations, opened_hdf5
 from rfm_labels.datasets.lerobot_meta import EPISODES_FILE, column_types, json_lines, read_table
@@ -24,21 +24,24 @@ _MEANINGS = {
     **dict.fromkeys(("", "nan", "none", "suboptimal"), None),  # suboptimal: it may have ended well or not
 }
 _COSTS = {"-1": False, "0": True}  # rewards of -1 until success
-Stored: TypeAlias = Mapping[int, tuple[str, Sequence[Any]]]  # place for messages, and one or T values, by episode
+Stored: TypeAlias = Mapping[Any, tuple[str, Sequence[Any]]]  # place for messages, and one or T values, by episode
 
 
 def read_outcomes(
     source: str, dataset: Path | None = None, names: Mapping[int, str] | None = None
-) -> dict[int, bool | None]:
-    """Return each episode's outcome by number; None: unknown. Raises DatasetError.
+) -> dict[Any, bool | None]:
+    """Return each episode's outcome by number, in a CSV file by name if ``names`` lack it; None: unknown.
 
     An episode succeeds if any of its frames does, as in LeRobot's evaluation. Values: true, false, 1, 0; rewards of 1
     and 0, or of 0 and -1; success, failure and similar words; null, NaN, an empty cell or "suboptimal" for unknown.
 
-    source: a CSV file with the columns ``episode`` and ``success``; a LeRobot column, per frame or per episode; an
-        attribute or array of each demonstration in an HDF5 file; or a reader, ``FILE.py:FUNCTION``
+    source: a CSV file with the columns ``episode`` (a number, a name, or both as tables show them: ``0 (red_cup.mp4)``)
+        and ``success``; a LeRobot column, per frame or per episode; an attribute or array of each demonstration in an
+        HDF5 file; or a reader, ``FILE.py:FUNCTION``
     dataset: the LeRobot folder, the HDF5 file, or the folder of the reader's recordings
     names: of the labelled episodes, by number, which a reader must give in the same order; None: unchecked
+
+    Raises DatasetError.
     """
     if is_reader(source):
         require("outcome", dataset is not None, "the folder of the recordings with a reader", "none")
@@ -50,7 +53,7 @@ def read_outcomes(
             outcomes[number] = episode.success
         return outcomes
     if Path(source).suffix.lower() == ".csv":
-        return _outcomes(_SUCCESS, _of_csv(Path(source)))
+        return _outcomes(_SUCCESS, _of_csv(Path(source), names or {}))
     if dataset is not None and is_hdf5(dataset):
         return _outcomes(source, _of_hdf5(source, dataset))
     if dataset is None or not (dataset / "meta").is_dir():
@@ -59,7 +62,8 @@ def read_outcomes(
     return _outcomes(source, _of_lerobot(source, dataset))
 
 
-def _of_csv(file: Path) -> Stored:
+def _of_csv(file: Path, names: Mapping[int, str]) -> Stored:
+    known = {text: number for number, name in names.items() for text in (name, named(number, name))}
     try:
         with file.open(newline="", encoding="utf-8-sig") as content:
             rows = list(csv.DictReader(content))
@@ -67,34 +71,32 @@ def _of_csv(file: Path) -> Stored:
         raise DatasetError.at(file, "a CSV file", error) from error
     got = ", ".join(rows[0]) if rows else "no rows"
     require(file, bool(rows) and {_EPISODE, _SUCCESS} <= rows[0].keys(), f"the columns {_EPISODE} and {_SUCCESS}", got)
-    stored: dict[int, tuple[str, Sequence[Any]]] = {}
+    stored: dict[Any, tuple[str, Sequence[Any]]] = {}
     for number, row in enumerate(rows, 2):
         where, text = f"{file}: line {number}", (row[_EPISODE] or "").strip()
-        require(f"{where}: {_EPISODE}", text.isdecimal(), "the number of an episode", repr(text))
-        require(where, int(text) not in stored, "each episode once", f"{text} again")
-        stored[int(text)] = f"{where}: {_SUCCESS}", [row[_SUCCESS]]
+        episode: Any = int(text) if text.isdecimal() else known.get(text, text)
+        other = known.get(text, episode)
+        either = f": write {named(other, text)} or {named(episode, names.get(episode))}" if other != episode else ""
+        is_one = bool(text) and not either
+        require(f"{where}: {_EPISODE}", is_one, "the number or name of one episode", f"{text!r}{either}")
+        require(where, episode not in stored, "each episode once", f"{text} again")
+        stored[episode] = f"{where}: {_SUCCESS}", [row[_SUCCESS]]
     return stored
 
 
 def _of_hdf5(name: str, file: Path) -> Stored:
     with opened_hdf5(file) as opened:
-        groups = {
-            number: group for number, (_, group) in demonstrations(file, opened).items() if hasattr(group, "keys")
-        }
-        known = sorted({each for group in groups.values() for each in (*group.attrs, *_arrays(group))})
-        require("outcome", name in known, f"a CSV file, a reader, or one of {', '.join(known)}", repr(name))
-        return {
-            number: (f"outcome: {group.name}: {name}", np.ravel(_stored(group, name)).tolist())
-            for number, group in groups.items()
-        }
-
-
-def _arrays(group: Any) -> Iterator[str]:
-    return (name for name, value in group.items() if hasattr(value, "shape"))
-
-
-def _stored(group: Any, name: str) -> Any:
-    return group.attrs[name] if name in group.attrs else group[name][()] if name in group else []
+        stored, known = {}, set[str]()
+        for number, (_, group) in demonstrations(file, opened).items():
+            if hasattr(group, "keys"):
+                arrays = [each for each, value in group.items() if hasattr(value, "shape")]
+                holders = dict.fromkeys(arrays, group) | dict.fromkeys(group.attrs, group.attrs)
+                values = np.ravel(holders[name][name]).tolist() if name in holders else []
+                stored[number] = f"outcome: {group.name}: {name}", values
+                known |= holders.keys()
+        expected = f"a CSV file, a reader, or one of {', '.join(sorted(known))}"
+        require("outcome", name in known, expected, repr(name))
+        return stored
 
 
 def _of_lerobot(name: str, dataset: Path) -> Stored:
@@ -118,14 +120,14 @@ def _of_lerobot(name: str, dataset: Path) -> Stored:
     return {line["episode_index"]: (f"{where}: {name}", [line.get(name)]) for where, line in lines}
 
 
-def _outcomes(source: str, stored: Stored) -> dict[int, bool | None]:
+def _outcomes(source: str, stored: Stored) -> dict[Any, bool | None]:
     texts = {episode: [_text(value) for value in values] for episode, (_, values) in stored.items()}
     found = {text for text in chain.from_iterable(texts.values()) if _MEANINGS.get(text, True) is not None}
     expected = "-1 or 1 in some episode, which shows whether 0 is a failure"
     require(f"outcome: {source}", "reward" not in source or found != {"0"}, expected, "0 in all")
     are_costs = "reward" in source and "-1" in found and found <= _COSTS.keys()
     meanings: Mapping[str, bool | None] = {**_MEANINGS, **_COSTS} if are_costs else _MEANINGS
-    outcomes: dict[int, bool | None] = {}
+    outcomes: dict[Any, bool | None] = {}
     for episode, (where, values) in stored.items():
         for text, value in zip(texts[episode], values, strict=True):
             require(where, text in meanings, "true, false, 1, 0, success or failure", repr(value))

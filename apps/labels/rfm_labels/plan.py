@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
-from rfm_client import InvalidSampleError, RewardError, UInt8Array
+from rfm_client import InvalidSampleError, ModelInfo, RewardError, UInt8Array
 from rfm_client.frames import (
     ChannelOrder,
     Correction,
@@ -190,6 +190,7 @@ class Recipe:
             lines.append(f"sampling: {self.sampling.rule} ({who})")
         if self.sampling.frames is not None:
             lines.append(f"frames: {self.sampling.frames} ({'asked for' if options.frames else _FRAMES_REASON})")
+        lines += [warning] if (warning := ModelInfo.warning_of(self.checkpoint.weights_digest)) else []
         return lines + [f"fuse: {self.fuse} of {len(self.cameras)} cameras"] * (len(self.cameras) > 1)
 
     def check_lengths(self, episodes: Sequence[DatasetEpisode]) -> None:

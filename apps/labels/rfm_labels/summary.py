@@ -67,7 +67,7 @@ class Summary:
             numbers = self.episodes[has_it].tolist()
             more = " ..." if len(numbers) > _MOST_LISTED else ""
             listed = ", ".join(named(number, self.names.get(number)) for number in numbers[:_MOST_LISTED])
-            by_outcome[outcome] = f"{len(numbers)}: {listed}{more}"
+            by_outcome[outcome] = f"{len(numbers)}{': ' * bool(numbers)}{listed}{more}"
         return [
             ("episodes", str(len(self.episodes))),
             ("frames", str(self.num_frames)),

@@ -238,18 +238,10 @@ async def _ranking(client: AsyncRewardClient, asked: _Asked) -> dict[str, Any]:
     except InvalidSampleError as error:
         raise invalid((error.where,), error.problem) from None
     ranking = Ranking(results=results)
-    pairs = [(*couple, ranking.pair(*couple)) for couple in ranking.couples()]
     return {
         "model_version": ranking.model_version,
         "videos": [{"wins": wins, "rank": rank} for wins, rank in zip(ranking.wins, ranking.ranks, strict=True)],
-        "orders": [
-            {"first": first, "second": second, "preference": result.preference}
-            for (first, second), result in sorted(results.items())
-        ],
-        "pairs": [
-            {"first": first, "second": second, "verdict": pair.verdict, "orders_agree": pair.orders_agree}
-            for first, second, pair in pairs
-        ],
+        **ranking.document(ranking.numbers),
     }
 
 

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from fastapi import HTTPException
 from PIL import Image
 
-from rfm_client import UInt8Array
+from rfm_client import ModelInfo, UInt8Array
 from rfm_client.episodes import SuccessRule
 from rfm_client.frames import ChannelOrder, Correction, Orientation
 from rfm_labels import (
@@ -120,6 +120,8 @@ class ShownDataset:
         rows = {} if summary is None else dict(zip(summary.episodes.tolist(), _rows(summary), strict=True))
         provenance = None if file is None else read_provenance(file)
         given = ((provenance or {}).get("dataset") or {}).get("task") or {"text": "", "overrides": False}
+        checkpoint = (provenance or {}).get("checkpoint")  # of another writer, perhaps a text
+        digest = checkpoint.get("weights_digest") if isinstance(checkpoint, dict) else None
         return {
             "labels": None if file is None else self._name_of(file),
             "cameras": list(self.cameras),
@@ -129,6 +131,7 @@ class ShownDataset:
             "corrections": [asdict(self._correction(file, camera)) for camera in self.cameras],
             "threshold": SuccessRule.threshold,
             "provenance": provenance,
+            "warning": ModelInfo.warning_of(digest),
             "written_s": None if status is None else status.st_mtime,
             "episodes": [
                 {

@@ -17,7 +17,7 @@ import numpy as np
 
 from rfm_client.cli.command import usage_errors
 from rfm_client.cli.options import SYNTHETIC_TASK, asked_model
-from rfm_client.cli.show import number, table
+from rfm_client.cli.show import number, table, wrapped
 from rfm_client.client import RewardClient
 from rfm_client.contract.checks import counted
 from rfm_client.contract.description import ModelInfo
@@ -95,7 +95,8 @@ class Measured:
         lines = [table(title, columns, [[*row, share, str(failed)]])]
         lines += [f"{count} failed: {reason}" for reason, count in self.failures.items()]
         verdict = "held" if self.is_held else f"not held (expected at least {ENOUGH:.0%} in time, and none failed)"
-        return "\n".join([*lines, f"{share} of the steps were answered within {1e3 / load.hz:.4g} ms: {verdict}"])
+        lines.append(f"{share} of the steps were answered within {1e3 / load.hz:.4g} ms: {verdict}")
+        return "\n".join([lines[0], *map(wrapped, lines[1:])])
 
 
 def measure(client: RewardClient, load: Load) -> Measured:

@@ -42,7 +42,7 @@ from rfm_client.cli.options import (
 from rfm_client.cli.show import scores_table, status_tables, wrapped
 from rfm_client.contract.errors import DeadlineExceededError, RewardError
 from rfm_client.contract.results import FRAME_SCORES
-from rfm_client.plot import save
+from rfm_client.plot import plot_scores, save
 from rfm_client.recording import Recording
 
 app = typer.Typer(
@@ -113,12 +113,13 @@ def score(
     if output.prints_tables and shown:
         print("\n" + wrapped(prefix.rule, "  ", "  "))
     infos = [outcome.info for outcome in shown]
-    for note in dict.fromkeys(f"{info.warning}; {info.remedy}" for info in infos if info.warning):
-        report(f"note: {note}")
+    scoring.report_warnings(infos)
     output.write_json(documents.score_document(server, video, prefix, outcomes))
     title = scoring.heading(video.task, infos, output.caption)
     if output.plot is not None and shown:
-        save(scoring.figure(shown, title, output.size), output.plot)
+        names, times_s = scoring.unique_stems([each.name for each in shown]), [each.times_s for each in shown]
+        results = [each.result for each in shown]
+        save(plot_scores(results, names, title=title, times_s=times_s, size=output.size), output.plot)
     if output.strips is not None and shown:
         from rfm_client.cli.pictures import plot
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 from rfm_client.cli.options import VideoOptions
-from rfm_client.cli.scoring import Source
+from rfm_client.cli.scoring import Source, report_warnings
 from rfm_client.cli.show import at_end, number, table, title_at_end
 from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InvalidSampleError
@@ -35,32 +35,25 @@ class Comparison(Ranking):
     scores: Sequence[ProgressResult]
 
     def tables(self) -> list[str]:
-        """Return a table of sources, best first, a table of pairs, and without a ranking a legend."""
-        columns = ("video", "rank", "P(wins)", title_at_end(self.scores[0]), "final success", "frames")
+        """Return a table of sources, best first, a table of pairs by number, and without a ranking a legend."""
+        columns = ("video", "#", "rank", "P(wins)", title_at_end(self.scores[0]), "final success", "frames")
         pairs = ("first", "second", "P(first wins)", "order swapped", "mean", "orders")
         return [
-            table("", columns, [self._row(index) for index in self._shown]),
-            table("", pairs, [self._pair_row(*couple) for couple in self.couples()], names=2),
+            table("", columns, [self._row(index) for index in self.ranking or self.numbers]),
+            table("", pairs, [self._pair_row(*couple) for couple in self.couples()]),
             *([LEGEND] if self.ranking is None else []),
         ]
-
-    @property
-    def _shown(self) -> Sequence[int]:
-        return self.ranking or self.numbers
-
-    def _rank(self, index: int) -> str:
-        return str(self.ranks[index] or "?")
 
     def _row(self, index: int) -> tuple[str, ...]:
         scores = self.scores[index]
         figures = (number(self.wins[index]), at_end(scores), number(scores.success[-1]))
-        return (self.sources[index].name, self._rank(index), *figures, str(len(scores.progress)))
+        rank = str(self.ranks[index] or "?")
+        return (self.sources[index].name, str(index + 1), rank, *figures, str(len(scores.progress)))
 
     def _pair_row(self, first: int, second: int) -> tuple[str, ...]:
         pair = self.pair(first, second)
-        names = (self.sources[index].name for index in (first, second))
         orders = "agree" if pair.verdict else "no answer"
-        return (*names, *map(number, (*(pair.both_orders or ()), pair.preference)), orders)
+        return (str(first + 1), str(second + 1), *map(number, (*(pair.both_orders or ()), pair.preference)), orders)
 
 
 def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> Comparison:
@@ -78,6 +71,7 @@ def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> 
         cast(ProgressResult, with_frame_indices(each, fit.frame_indices)) for each, fit in zip(alone, fits, strict=True)
     ]
     one_version((*scores, *answers), "all videos")
+    report_warnings([info])
     results = dict(zip(orders, cast("list[PreferenceResult]", answers), strict=True))
     return Comparison(sources=sources, scores=scores, results=results)
 

@@ -17,7 +17,6 @@ from rfm_client.contract.errors import RewardError
 from rfm_client.contract.results import (
     FRAME_SCORES,
     FrameScores,
-    PreferenceResult,
     Result,
     answer,
     trajectory_scores,
@@ -41,7 +40,6 @@ def comparison_document(server: ServerOptions, video: VideoOptions, comparison: 
     For two videos, the top level also has the ``preference`` in the given order, the verdict from both orders, and
     scores as ``first`` and ``second``. Scores are those from ``score``. A missing verdict, rank or ranking is null.
     """
-    names = [source.name for source in comparison.sources]
     videos = [
         {
             "source": source.name,
@@ -54,22 +52,14 @@ def comparison_document(server: ServerOptions, video: VideoOptions, comparison: 
             comparison.sources, comparison.scores, comparison.wins, comparison.ranks, strict=True
         )
     ]
-    orders = [
-        {"first": names[first], "second": names[second], "preference": result.preference}
-        for (first, second), result in comparison.results.items()
-    ]
-    pairs = [
-        {"first": names[first], "second": names[second], **_verdict(comparison.pair(first, second))}
-        for first, second in comparison.couples()
-    ]
+    answers = comparison.document([source.name for source in comparison.sources])
     asked = comparison.results[0, 1]
     document = {**server.origin, **_asked(video), "model_version": asked.model_version}
     if len(videos) == len(SIDES):
-        document |= {"preference": asked.preference, **_verdict(comparison.pair(0, 1))}
-        document |= dict(zip(SIDES, videos, strict=True))
+        document |= {"preference": asked.preference, **answers["pairs"][0], **dict(zip(SIDES, videos, strict=True))}
     best_first = comparison.ranking
     ranking = None if best_first is None else [videos[index] for index in best_first]
-    return {**document, "orders": orders, "pairs": pairs, "videos": videos, "ranking": ranking}
+    return {**document, **answers, "videos": videos, "ranking": ranking}
 
 
 def samples_document(server: ServerOptions, kind: str, outcomes: Sequence[Result | RewardError]) -> dict[str, Any]:
@@ -124,10 +114,6 @@ def _outcome(outcome: Outcome) -> dict[str, Any]:
     about = {"source": outcome.name, "num_frames": outcome.num_frames, "took_s": outcome.took_s}
     scores = frame_document(outcome.result, outcome.times_s)
     return {**about, "model_version": outcome.result.model_version, **scores}
-
-
-def _verdict(pair: PreferenceResult) -> dict[str, Any]:
-    return {"verdict": pair.verdict, "orders_agree": pair.orders_agree}
 
 
 def _error(error: Exception, message: str) -> dict[str, Any]:

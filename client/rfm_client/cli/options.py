@@ -106,13 +106,9 @@ class ServerOptions(CredentialFiles):
     def connected(self, **options: Any) -> Iterator[RewardClient]:
         """Yield a client if a server answers and serves the model. Otherwise raise RewardError at once."""
         with self.client(**options) as client:
-            problems: list[RewardError] = []
-            for url in self.urls:
-                if (problem := self._problem(url)) is None:
-                    break
-                problems.append(problem)
-            else:
-                raise problems[0]
+            problems = map(self._problem, self.urls)
+            if (first := next(problems)) is not None and all(problems):  # asks until a server scores
+                raise first
             yield client
 
     def _problem(self, url: str) -> RewardError | None:

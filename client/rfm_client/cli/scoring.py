@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import PurePath
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.cli.command import ExitCode, exit_code, exit_code_of, missing_package, user_message
+from rfm_client.cli.command import ExitCode, exit_code, exit_code_of, missing_package, report, user_message
 from rfm_client.cli.options import PrefixOptions, VideoOptions
 from rfm_client.cli.pictures import Panel
 from rfm_client.cli.show import Table, at_end, number, title_at_end
@@ -31,12 +31,8 @@ from rfm_client.contract.errors import (
 from rfm_client.contract.results import FrameScores, ProgressResult
 from rfm_client.contract.samples import Trajectory
 from rfm_client.frames.sampling import Sampling
-from rfm_client.plot import Size, plot_scores
 from rfm_client.recording import Recording
 from rfm_client.scoring.samples import CallOptions
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 WORKERS = 8  # videos in memory at a time
 PROBE_S = 2.0  # timeout for checking that a server is alive
@@ -184,6 +180,12 @@ class SourceScorer:
         return self._gone is not None
 
 
+def report_warnings(infos: Iterable[ModelInfo]) -> None:
+    """Report what everyone who sees these checkpoints' scores must know, once."""
+    for note in dict.fromkeys(f"{info.warning}; {info.remedy}" for info in infos if info.warning):
+        report(f"note: {note}")
+
+
 def exit_code_of_outcomes(outcomes: Sequence[Outcome]) -> ExitCode:
     """Return the exit code of a command with these outcomes."""
     failures = [outcome for outcome in outcomes if isinstance(outcome, Failed)]
@@ -227,14 +229,3 @@ def _checkpoint(info: ModelInfo) -> str:
     source = info.source or info.name
     run = source.removesuffix("/checkpoint")  # a name, unless the folder is a version
     return source if run.isdecimal() else run
-
-
-def figure(scored: Sequence[Scored], title: str, size: Size) -> Figure:
-    """Return one figure with these sources' curves. Raises ImportError without matplotlib."""
-    return plot_scores(
-        [each.result for each in scored],
-        unique_stems([each.name for each in scored]),
-        title=title,
-        times_s=[each.times_s for each in scored],
-        size=size,
-    )

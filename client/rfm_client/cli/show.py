@@ -64,16 +64,17 @@ class Table:
 
     columns: headers
     cells: all cells in each column, or stand-ins of the same width
-    names: how many leading columns hold names and paths, which stand on lines of their own, above their row's other
-        cells, if the table does not fit the terminal
+
+    If the table does not fit the terminal, its first column, names and paths, stands on lines of its own, above the
+    row's other cells.
     """
 
-    def __init__(self, columns: Sequence[str], cells: Sequence[Iterable[str]], *, names: int = 1) -> None:
+    def __init__(self, columns: Sequence[str], cells: Sequence[Iterable[str]]) -> None:
         self._columns, self._above = columns, 0
         headed = zip(columns, cells, strict=True)
         self._widths = [max(map(len, (*head.split(), *column, ""))) for head, column in headed]
         if not self.fits:
-            self._above, self._widths = names, self._widths[names:]
+            self._above, self._widths = 1, self._widths[1:]
 
     @property
     def fits(self) -> bool:
@@ -98,14 +99,14 @@ class Table:
         return f"{GAP * (2 if self._above else 1)}{GAP.join(padded)}".rstrip()
 
 
-def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, names: int = 1) -> str:
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a ``Table`` below a title, if given. Columns that do not fit follow below, after the names."""
-    lines, begin = [wrapped(title)] * bool(title), names
+    lines, begin = [wrapped(title)] * bool(title), 1
     while begin < len(columns):
         for end in range(len(columns), begin, -1):
-            shown = [*range(names), *range(begin, end)]
+            shown = [0, *range(begin, end)]
             part = [[row[column] for column in shown] for row in (columns, *rows)]
-            made = Table(part[0], [*zip(*part[1:], strict=True)] or [()] * len(shown), names=names)
+            made = Table(part[0], [*zip(*part[1:], strict=True)] or [()] * len(shown))
             if made.fits:
                 break
         lines += [*made.head, *map(made.row, part[1:]), ""]
@@ -159,7 +160,7 @@ def status_tables(status: ServerStatus) -> str:
         table(title, requests, counted),
         *(f"{model.name} {model.version}: {model.reason}" for model in status.models if model.reason),
         table("", batches, batched),
-        *filter(None, [status.metrics_error]),
+        *map(wrapped, filter(None, [status.metrics_error])),
     ]
     if status.devices:
         columns = ("device", "utilization", "memory used", "memory")

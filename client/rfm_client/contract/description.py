@@ -166,7 +166,12 @@ class Description(Origin):
     @property
     def warning(self) -> str | None:
         """What everyone who sees a score must know; None: nothing."""
-        return TOY if self.weights_digest in _TOYS else None
+        return self.warning_of(self.weights_digest)
+
+    @staticmethod
+    def warning_of(weights_digest: str | None) -> str | None:
+        """Return the ``warning`` about a checkpoint with these weights."""
+        return TOY if weights_digest in _TOYS else None
 
     @property
     def remedy(self) -> str | None:

@@ -8,7 +8,7 @@ orders disagree, the pair has no verdict.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from statistics import fmean
@@ -45,6 +45,18 @@ class Ranking:
     def couples(self) -> Iterator[Order]:
         """Yield every pair of trajectories once, in the given order."""
         return itertools.combinations(self.numbers, 2)
+
+    def document(self, names: Sequence[object]) -> dict[str, list[dict[str, object]]]:
+        """Return the answers for JSON, in both ``orders`` and of the ``pairs``. names: of the trajectories"""
+
+        def of(first: int, second: int, **answer: object) -> dict[str, object]:
+            return {"first": names[first], "second": names[second], **answer}
+
+        pairs = [(couple, self.pair(*couple)) for couple in self.couples()]
+        return {
+            "orders": [of(*order, preference=result.preference) for order, result in sorted(self.results.items())],
+            "pairs": [of(*couple, verdict=pair.verdict, orders_agree=pair.orders_agree) for couple, pair in pairs],
+        }
 
     @cached_property
     def wins(self) -> list[float]:

@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rfm_client.command_line import JsonOutput, number, print_table, with_options
-from rfm_client.options import counted, setting
+from rfm_client.options import counted, first_names, setting
 
 if TYPE_CHECKING:
     from rfm_labels import LabelComparison
 
-LEGEND = (
-    "VOC: rank correlation of progress with time, mean over {}. AUROC: of success, by the vote of the last three "
-    "frames, and of progress at the last frame; 0.5 is chance. Threshold: of the vote, with the best balanced accuracy."
-    " Falls: steps on which progress falls by more than 0.01."
+VOC = "VOC: rank correlation of progress with time, mean over {}. "
+BY_OUTCOME = (
+    "AUROC: of success, by the vote of the last three frames, and of progress at the last frame; 0.5 is chance. "
+    "Threshold: of the vote, with the best balanced accuracy. "
 )
+FALLS = "Falls: steps on which progress falls by more than 0.01."
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,8 @@ def evaluate(
     if not files:
         expected = "label files, NAME_progress.parquet (rfm-client label), or --labels"
         raise DatasetError.at(dataset, expected, "none")
-    names = {number: name for file in files for number, name in read_names(file).items()}
-    comparison = evaluate_labels(files, None if outcome is None else read_outcomes(outcome, dataset, names))
+    outcomes = None if outcome is None else read_outcomes(outcome, dataset, read_names(*files))
+    comparison = evaluate_labels(files, outcomes)
     if output.prints_tables:
         _print_tables(comparison)
     output.write_json(document(comparison))
@@ -86,14 +87,11 @@ def _print_tables(comparison: LabelComparison) -> None:
     if known is not None:
         columns[5:5] = ["of successes", "of failures", "AUROC success", "AUROC progress", "threshold", "accuracy"]
     for each in comparison.evaluations:
-        cells = [each.name, number(each.spearman), number(each.kendall), str(each.num_constant)]
-        cells.append(number(each.final))
+        cells = [each.name, number(each.spearman), number(each.kendall), str(each.num_constant), number(each.final)]
         if known is not None:
-            success, progress = each.by_success, each.by_progress
-            cells += [number(each.final_of_successes), number(each.final_of_failures)]
-            cells += [number(ranking.auroc if ranking else None) for ranking in (success, progress)]
-            cells.append(number(success.threshold if success else None))
-            cells.append(number(success.balanced_accuracy if success else None))
+            aurocs = [ranking and ranking.auroc for ranking in (each.by_success, each.by_progress)]
+            by_vote = each.by_success and (each.by_success.threshold, each.by_success.balanced_accuracy)
+            cells += map(number, (each.final_of_successes, each.final_of_failures, *aurocs, *(by_vote or (None, None))))
         rows.append([*cells, f"{each.backwards:.1%}"])
     counts = counted(len(comparison.episodes), "episode")
     if known is not None:
@@ -102,7 +100,11 @@ def _print_tables(comparison: LabelComparison) -> None:
         counts += f"; {comparison.num_left_out} left out, which not all files have"
     if comparison.num_without_outcome:
         counts += f"; {comparison.num_without_outcome} left out, whose outcome is unknown"
-    print_table(counts, columns, rows, LEGEND.format("all episodes" if known is None else "successes"))
+    if comparison.without_labels:
+        unused = counted(len(comparison.without_labels), "outcome")
+        counts += f"; {unused} unused, of episodes without labels: {first_names(comparison.without_labels)}"
+    legend = VOC.format("all episodes") if known is None else VOC.format("successes") + BY_OUTCOME
+    print_table(counts, columns, rows, legend + FALLS)
 
 
 def document(comparison: LabelComparison) -> dict[str, Any]:

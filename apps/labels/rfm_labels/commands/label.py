@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias, get_args
 
@@ -19,7 +18,7 @@ from rfm_client.frames import ChannelOrder, Orientation
 from rfm_client.options import ConfigError, Settings, counted, first_names, setting
 from rfm_labels.audit import audit
 from rfm_labels.datasets.dataset import Dataset, DatasetEpisode, SeveralTasks, parsed_by_camera
-from rfm_labels.datasets.faults import FaultsError, UnusedTaskError, listed, require
+from rfm_labels.datasets.faults import DatasetError, FaultsError, UnusedTaskError, listed, require
 from rfm_labels.datasets.hdf5 import label_prefix
 from rfm_labels.datasets.hub import ASK_BYTES, DownloadSize
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
@@ -278,17 +277,17 @@ class LabelCommand:
         """Run as the options say. Raises RewardError, OSError and ImportError."""
         if not (self.texts.reader or self.texts.videos) and (files := hdf5_files(self.source)):
             return self._run_each(files)
-        for name, command in self._instead.items():
-            if getattr(self.options, name):
-                command()
-                return ExitCode.OK
-        return self._tell(self._label())
-
-    @property
-    def _instead(self) -> dict[str, Callable[[], None]]:
-        """What to do instead of labelling, by option."""
-        remove = partial(self._remove, [self])
-        return {"report": self._report, "dry_run": self._try, "list_labels": self._list, "remove": remove}
+        if self.options.remove:
+            self._remove([self])
+        elif self.options.report:
+            self._report()
+        elif self.options.dry_run:
+            self._try()
+        elif self.options.list_labels:
+            self._list()
+        else:
+            return self._tell(self._label())
+        return ExitCode.OK
 
     def _run_each(self, files: Sequence[Path]) -> ExitCode:
         """Run for each HDF5 file in a folder, once all can be opened. Raises DatasetError if one cannot."""
@@ -308,7 +307,13 @@ class LabelCommand:
         reads_frames = not (self.options.report or self.options.list_labels)
         for command in self._checked(commands) if reads_frames else commands:
             self.say(f"{command.source}")
-            codes.append(command.run())
+            try:
+                codes.append(command.run())
+            except DatasetError as error:
+                if not self.options.report:
+                    raise
+                self.say(f"{error}")  # no labels there; others may have some
+                codes.append(ExitCode.FAILED)
         return next((code for code in codes if code is not ExitCode.OK), ExitCode.OK)
 
     def _checked(self, commands: Sequence[LabelCommand]) -> list[LabelCommand]:
@@ -369,7 +374,7 @@ class LabelCommand:
             ("dataset", f"{dataset.kind}: {source}"),
             ("episodes", str(len(plan.items))),
             ("frames", f"{plan.num_frames}, {decoded}"),
-            (f"tasks: {len(tasks)}", "; ".join(tasks[:5]) + (" ..." if len(tasks) > 5 else "")),
+            ("tasks", f"{len(tasks)}: {'; '.join(tasks[:5])}{' ...' * (len(tasks) > 5)}"),
             ("doubts", "none" if not doubts else str(len(doubts))),
         ]
         print_facts(rows)
@@ -414,32 +419,42 @@ class LabelCommand:
 
     def _list(self) -> None:
         """List the labels that are there."""
-        outputs, rows, named = self._outputs(self.labels), [], dict[object, str]()
-        for each in map(LabelFile.read, find_label_files(Path(self.source), outputs.folder)):
-            name = reward_name(each.path).removeprefix(outputs.prefix)
+        rows, named = [], dict[object, str]()
+        for name, file in self._there().items():
+            each = LabelFile.read(file)
             first = named.setdefault(tuple(each.digests.items()) or name, name)
             same = "-" if first == name else first  # as an alias is
             rows.append((name, each.checkpoint or "-", str(len(each.digests) or "-"), same))
         if rows:
             print_table("", ("labels", "checkpoint", "episodes", "equals"), rows)
         else:
-            self.say(f"{self.source}: no labels in {outputs.folder}: label it first, or name their --output")
+            folder = self._outputs(self.labels).folder
+            self.say(f"{self.source}: no labels in {folder}: label it first, or name their --output")
+
+    def _there(self) -> dict[str, Path]:
+        """The label files that are there, by name."""
+        outputs = self._outputs(self.labels)
+        files = find_label_files(Path(self.source), outputs.folder)
+        return {reward_name(file).removeprefix(outputs.prefix): file for file in files}
 
     def _remove(self, commands: Sequence[LabelCommand]) -> None:
         """Delete the label files of a name of these datasets. Raises DatasetError, or typer.Abort after a "no"."""
         for option in ("name", "episodes", "filter_key", "limit", "shard"):
             if getattr(self.labels, option) != getattr(DEFAULTS, option):
                 raise ConfigError.of_two("remove", "excludes", option)
-        labels = replace(self.labels, name=self.options.remove or "")
-        places = [command._outputs(labels) for command in commands]
-        files = [(place, file) for place in places for file in place.before()]
-        require(places[0].folder, bool(files), f"label files {labels.name}", "none; --list shows the others")
+        name = self.options.remove or ""
+        places = [command._outputs(replace(self.labels, name=name)) for command in commands]
+        files = [(place, file) for place in places for file in place.before() or place.before(alias=name)]
+        if not files:
+            there = dict.fromkeys(each for command in commands for each in command._there())
+            expected = f"one of the labels {', '.join(there)}" if there else "labels"
+            raise DatasetError.at(places[0].folder, expected, repr(name) if there else "none")
         for _, file in files:
             require(file.path, bool(file.provenance), "labels of rfm-client", "others: delete the file yourself")
-        where = ", ".join(dict.fromkeys(str(labels.parts or place.own_parts) for place, _ in files))
-        lost = [file.path for place, file in files if not place.keeps(file)]
+        parts = {file.path: place.parts_of(file) for place, file in files}
+        lost = [path for path, where in parts.items() if not where]
         if lost and not self.options.yes:
-            got = f"{first_names(lost)}, whose episodes are not all in {where}"
+            got = f"{first_names(lost)}, whose finished episodes are gone"
             _confirm(f"Delete {got}?", "--yes for labels that must be scored again", f"none for {got}")
         remove_files([file.path for _, file in files])
         for _, file in files:
@@ -448,9 +463,10 @@ class LabelCommand:
         folders = dict.fromkeys(place.folder for place, _ in files)
         for path in (path for folder in folders for path in sorted(folder.glob("[!.]*.parquet"))):
             if LabelFile.read(path).digests in gone:
-                self.say(f"note: {path} has the same labels and stays; delete it, too, if it is an alias")
+                other = reward_name(path).rpartition(".")[2]
+                self.say(f"note: {path} has the same labels and stays; --remove {other} deletes it")
         if not lost:
-            self.say(f"the command that made them writes them again from {where}")
+            self.say(f"the command that made them writes them again from {', '.join(dict.fromkeys(parts.values()))}")
 
     def _dataset(self) -> Dataset:
         return open_dataset(self.source, **self.texts.opening)

@@ -402,6 +402,7 @@ export class DatasetTab {
     if (broken) told.push(`${broken} cannot be labelled now: see their tasks.`);
     if (judgedOnes.length) told.push(`${never} of ${judgedOnes.length} ${isWhole ? "episodes" : "of them"} never ${verb}.`);
     if (undone) told.push(`${undone} ${undone === 1 ? "succeeds, then undoes" : "succeed, then undo"} it.`);
+    if (this.#told.warning) told.push(`Note: ${this.#told.warning}.`);
     this.#page["ends-told"].textContent = told.join(" ");
     this.#histogram.show(labelled);
   }
