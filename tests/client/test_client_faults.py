@@ -358,16 +358,6 @@ def test_a_server_with_another_dev_shm_gets_the_inputs_through_the_socket(
     assert "no shared memory, inputs go through the socket: Unable to open shared memory region" in told
 
 
-def test_a_server_that_refuses_shared_memory_is_warned_of_once(
-    engines: EngineServer, caplog: pytest.LogCaptureFixture
-) -> None:
-    with RewardClient(engines.url, shared_memory=True) as client:
-        for _ in range(2):
-            client.progress(heavy(), frame_steps=2)
-    (told,) = (record.message for record in caplog.records if record.name == "rfm_client")
-    assert "no shared memory, inputs go through the socket: " in told
-
-
 ASKING = """
 import os, resource, signal, sys
 import numpy as np

@@ -15,17 +15,14 @@ from tritonclient.grpc import service_pb2, service_pb2_grpc
 from tritonclient.utils import np_to_triton_dtype
 
 import goldens
-import rfm_export
 from commands import own_regions
-from engines import load_engine, serve_config
+from engines import load_engine
 from mixtures import FRAMES_MODEL, MODEL, assert_same, counts, infer, mixed_samples, plug, wait_until_at_work
-from repositories import forget_input
 from rfm_client import (
     InvalidSampleError,
     PreferenceSample,
     ProgressSample,
     RewardClient,
-    RewardError,
     Sample,
     SimilaritySample,
     Trajectory,
@@ -236,24 +233,3 @@ def test_a_second_array_may_hold_frames_of_one_size(served: Served, model: str) 
     for name in outputs:
         assert np.isfinite(got[name][0]).all()
         np.testing.assert_allclose(got[name], expected[name], rtol=0, atol=TOLERANCE)
-
-
-@pytest.mark.nightly
-def test_a_model_from_before_pairs_of_two_frame_sizes_says_so(served: Served) -> None:
-    config = goldens.config(VLM)
-    rfm_export.export(config.checkpoint, served.repository, serve_config(config, "before"))
-    forget_input(served.repository, "before_frames", "second_frames")
-    wide, tall = video(0, 2, 56, 84), video(1, 2, 84, 56)
-    pairs = [PreferenceSample(wide, wide), PreferenceSample(wide, tall), PreferenceSample(tall, tall)]
-    with served.api() as api:
-        api.load("before_frames")
-        with served.client("grpc", "before") as client:
-            one_size, two_sizes, another_size = client.evaluate(pairs, return_errors=True)
-        api.unload("before_frames")
-    assert isinstance(two_sizes, InvalidSampleError)
-    assert two_sizes.message == (
-        "second_frames: expected a model that takes pairs of two frame sizes, "
-        "got one that was exported before there was this input; export it again, or resize a trajectory"
-    )
-    assert not isinstance(one_size, RewardError)
-    assert not isinstance(another_size, RewardError)
