@@ -14,7 +14,7 @@ import pytest
 
 from engine_server import EngineServer
 from engines import load_engine
-from mixtures import FRAMES_MODEL, assert_same, mixed_samples
+from mixtures import FRAMES_MODEL, assert_same
 from rfm_client import (
     FRAME_SCORES,
     AccessDeniedError,
@@ -62,24 +62,6 @@ def test_samples_of_a_model_that_is_not_served_fail_and_the_others_are_scored(en
     with engines.client() as client:  # MODEL has no encoders
         outcomes = client.evaluate([video, ProgressSample(random_trajectory(0, 2)), video], return_errors=True)
     assert [type(outcome) for outcome in outcomes] == [ModelNotFoundError, ProgressResult, ModelNotFoundError]
-
-
-def test_requests_in_flight_are_bounded() -> None:
-    class Counting(Shelf):
-        now = most = 0
-
-        async def infer(self, *asked: Any, **more: Any) -> Answer:
-            self.now += 1
-            self.most = max(self.most, self.now)
-            await asyncio.sleep(0.001)
-            self.now -= 1
-            return await super().infer(*asked, **more)
-
-    shelf = Counting()
-    with RewardClient("", transports=[shelf], max_in_flight=3) as client:
-        for future in [client.submit(sample) for sample in mixed_samples(30)]:
-            future.result()
-    assert shelf.most == 3
 
 
 def test_a_long_trajectory_is_subsampled_when_asked(engines: EngineServer) -> None:
