@@ -33,6 +33,17 @@ def description_of(model: Path) -> Description:
     return description_in(parse((model / CONFIG_FILE).read_text()))
 
 
+def forget_input(repository: Path, model: str, name: str) -> None:
+    """The model's configuration becomes one from before it had this input."""
+    with changing(repository / model) as config:
+        inputs = [tensor for tensor in config.input if tensor.name != name]
+        assert len(inputs) < len(config.input)
+        del config.input[:]
+        config.input.extend(inputs)
+        for step in config.ensemble_scheduling.step:
+            step.input_map.pop(name, None)
+
+
 def configure(model: Path, *, batch_size: int = 64, **parameters: int) -> None:
     """Change the batch size and parameters in an exported model's configuration."""
     with changing(model) as config:
