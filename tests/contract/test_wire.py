@@ -29,7 +29,7 @@ from rfm_client.contract import wire
 from rfm_client.contract.results import BatchTiming
 from rfm_client.contract.samples import EncoderSample
 
-OF_SOME = [name for name, score in FRAME_SCORES.items() if score.asked != "always" and not score.is_per_bin]
+OF_SOME = [name for name, score in FRAME_SCORES.items() if not (score.is_always_asked or score.is_per_bin)]
 OUTPUTS = [spec.name for spec in wire.score_outputs(NUM_BINS, OF_SOME)]
 TIMING = BatchTiming(1.5, 2.5)
 
@@ -292,7 +292,6 @@ def test_arrays_whose_length_varies_are_ragged_and_second_frames_optional() -> N
 
 def test_a_request_asks_for_every_given_score_except_those_on_request() -> None:
     sample = ProgressSample(embedded(0, 2))
-    always, given = {"progress", "success"}, {"unclear", "remaining_s", "relative_s", "entropy", "hop"}
+    always, given = {"progress", "success"}, {"log_prob", "unclear", "remaining_s", "relative_s", "entropy", "hop"}
     assert {*wire.outputs_for([sample])} == always
     assert {*wire.outputs_for([sample], FRAME_SCORES)} == always | given
-    assert {*wire.outputs_for([sample], FRAME_SCORES, all_scores=True)} == always | given | {"log_prob"}

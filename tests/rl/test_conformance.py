@@ -560,10 +560,6 @@ REFUSED_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
         {"success": SuccessRule(0.9), "success_bonus": 1.0, "terminate_on_success": SuccessRule(0.8)},
         "^success: expected None or the rule of terminate_on_success, ",
     ),
-    "an end that is not awaited": (
-        {"mode": "final", "blocking": False, "await_last": False},
-        "^await_last: expected True with mode 'final'",
-    ),
     "fuse": ({"fuse": "sum"}, "^fuse: expected one of mean, min, max, got 'sum'$"),
     "orient": ({"orient": "upside-down"}, "^orient: expected one of none, rotate180, .*, got 'upside-down'$"),
     "orient of a camera": ({"orient": {"front": "none"}}, "^orient: expected one for all frames, .*, got 'front'$"),

@@ -98,20 +98,16 @@ def test_with_too_many_questions_open_a_step_is_skipped_and_counted_until_a_rese
     env.close()
 
 
-@pytest.mark.parametrize("await_last", [True, False])
-def test_the_last_step_waits_so_that_late_rewards_add_up_unless_it_shall_not(
-    client: RewardClient, late: LateClient, await_last: bool
-) -> None:
-    env = not_blocking(late, mode="delta", max_pending=2, await_last=await_last)
+def test_the_last_step_waits_so_that_late_rewards_add_up(client: RewardClient, late: LateClient) -> None:
+    env = not_blocking(late, mode="delta", max_pending=2)
     late.hold(1, 2, 3)
     env.step(0)
     late.let_come(1)
     rewards, infos = play_on(env)
-    known = LENGTH if await_last else 1
-    first, second, newest = progress(client, VIDEO, [0, 1, known], None)
+    first, second, newest = progress(client, VIDEO, [0, 1, LENGTH], None)
     assert_close(rewards, [second - first, *[0] * (LENGTH - 3), newest - second])
     told = infos[-1]["reward_model"]
-    assert (told["step"], told["lag"], told["skipped"]) == (known, LENGTH - known, LENGTH - 4)
+    assert (told["step"], told["lag"], told["skipped"]) == (LENGTH, 0, LENGTH - 4)
     assert {step: answer.cancelled() for step, answer in late.answers.items()} == {1: False, 2: True, 3: True}
 
 
