@@ -35,9 +35,10 @@ class CrashLoopError(ServerStartError):
 
 
 class FaultCount:
-    """Counts Triton's consecutive faults. A fault after a run of STEADY_S starts a new count."""
+    """Counts Triton's consecutive faults. A fault after a run of ``steady_s`` starts a new count."""
 
-    def __init__(self) -> None:
+    def __init__(self, steady_s: float = STEADY_S) -> None:
+        self._steady_s = steady_s
         self._num_faults = 0  # in a row
         self._running_since_s: float | None = None  # None: not running
 
@@ -47,7 +48,7 @@ class FaultCount:
 
     def failed(self, reason: str) -> None:
         """Record a fault or a failed start. Raises CrashLoopError after more than MOST in a row."""
-        if self._running_since_s is not None and time.monotonic() - self._running_since_s >= STEADY_S:
+        if self._running_since_s is not None and time.monotonic() - self._running_since_s >= self._steady_s:
             self._num_faults = 0
         self._running_since_s = None  # a failed start does not count as running
         self._num_faults += 1
