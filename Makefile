@@ -178,7 +178,7 @@ lock: | $(BIN)/uv
 
 PROJECTS := pyproject.toml client/pyproject.toml $(wildcard apps/*/pyproject.toml)
 VERSIONED := $(PROJECTS) CITATION.cff docker/.env.example docker/compose.yaml \
-  docker/kubernetes/kserve/kustomization.yaml $(wildcard docker/kubernetes/overlays/*/kustomization.yaml) docs/guides/deploy.md
+  docker/kubernetes/kserve/kustomization.yaml $(wildcard docker/kubernetes/overlays/*/kustomization.yaml) docker/README.md
 
 # Write a version into every file that names it: make version VERSION=1.2.3
 version:

@@ -62,8 +62,8 @@ class CheckpointConfig(Settings):
     )
     video_prompt: VideoPrompt | None = setting(
         None,
-        "Video prompt of a Qwen3-VL: as in transformers before 5.10 (bare), or since, with one more vision start and "
-        "end around the video (wrapped). Default: by the checkpoint's transformers_version.",
+        "Video prompt of a Qwen3-VL: as before transformers 5.10 (bare), or since (wrapped). Default: by the "
+        "checkpoint's transformers_version.",
     )
     strict_answers: bool = setting(
         False, "Refuse samples with an unclear RoboReward answer (1.5, 3/5, two scores) instead of marking them."

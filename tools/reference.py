@@ -62,7 +62,7 @@ def _run_settings() -> str:
     defaults = {"size_px": "refused", **RunConfig(Path(), "", nothing).network()}
     return "".join(
         f"- `{name}` ({', '.join(f'`{key}`' for key in keys)}): {meanings[name]}. "
-        f"Without the key: {_text(defaults.get(name)) or 'unknown'}.\n"
+        f"Default: {_text(defaults.get(name)) or 'unknown'}.\n"
         for name, keys in SETTINGS.items()
     )
 

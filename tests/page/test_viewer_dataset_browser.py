@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from selenium.webdriver.support.select import Select
 from browsers import Browser
 from gateways import running
 from labelling import BrightnessScorer
+from paths import ROOT
 from rfm_client import RewardClient
 from rfm_labels import ClientScorer, LabelOptions, label, open_dataset, summarise
 from rfm_labels.datasets import LeRobotDataset
@@ -30,9 +32,10 @@ from viewer_requests import run_line
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
+TASK = "put the red block in the bowl"  # of the clips
 OTHER = "brightness"  # the second reward of the first dataset
 NUM_LARGE = 10_000
-DEMO, PLAIN, BRIGHT, LARGE = range(4)  # labelled by the demo, not, by brightness, and by chance
+DEMO, PLAIN, BRIGHT, LARGE, CLIPS = range(5)  # labelled by the demo, not, by brightness, by chance, and by the demo
 VIDEOS = "#episode-videos video"
 PLAYERS = f"{VIDEOS}, #episode-time"  # the videos, then the slider
 BEYOND = """
@@ -123,7 +126,11 @@ def folders(demo_server: Endpoints, tmp_path_factory: pytest.TempPathFactory) ->
     label(open_dataset(demo), BrightnessScorer(), LabelOptions(name=OTHER))
     corrected = open_dataset(bright, orient={"wrist": "rotate180"}, channels={"wrist": "bgr"})
     label(corrected, BrightnessScorer(), LabelOptions())
-    return demo, copied("toy_v21", folder / "plain"), bright, large(folder / "large", NUM_LARGE)
+    clips = folder / "clips"
+    shutil.copytree(ROOT / "apps" / "page" / "rfm_page" / "examples", clips)
+    with RewardClient(demo_server.grpc_url) as client:
+        label(open_dataset(clips, task=TASK), ClientScorer(client), LabelOptions())
+    return demo, copied("toy_v21", folder / "plain"), bright, large(folder / "large", NUM_LARGE), clips
 
 
 @pytest.fixture(scope="module")
@@ -355,6 +362,30 @@ def test_a_video_shows_the_frame_of_the_time(page: Page) -> None:
             assert off[t] == off.min() < 3, (t, off)
 
 
+HAVE_PLAYHEADS = "return [...document.querySelectorAll('#episode .playhead')].map((each) => !each.hidden)"
+ZOOM = """
+const over = document.querySelector("#motion-chart .u-over");
+const { left, width } = over.getBoundingClientRect();
+over.dispatchEvent(new WheelEvent("wheel", { clientX: left + width / 2, deltaY: arguments[0], ctrlKey: true }));
+"""
+
+
+def test_actions_and_states_move_and_zoom_with_the_curves(page: Page) -> None:
+    rows = parquet.read_table(page.choose(DEMO).root / "data" / "chunk-000" / "file-000.parquet").to_pylist()
+    page.at_rest(5)
+    own = [row for row in rows if row["episode_index"] == 5]
+    assert [each.text for each in page.browser.all("#motion-legend li")] == ["dx", "dy", "x", "y"]
+    page.move_to(0.7)
+    for signal, column, names in (("action", "action", "dx dy"), ("state", "observation.state", "x y")):
+        told = page.browser.values("motion-chart", signal)
+        assert list(told) == names.split()
+        assert [float(text) for text in told.values()] == pytest.approx(own[7][column], abs=0.006)
+    page.browser.run(ZOOM, -600)  # an eighth of the time is shown, from the middle
+    assert page.browser.run(HAVE_PLAYHEADS) == [False, False]
+    page.browser.run(ZOOM, 600)
+    assert page.browser.run(HAVE_PLAYHEADS) == [True, True]
+
+
 def test_an_episode_is_scored_as_it_was_for_the_labels_and_one_without_labels_too(page: Page) -> None:
     dataset = page.choose(DEMO)
     page.at_rest(0)
@@ -383,6 +414,24 @@ def test_an_episode_is_scored_as_it_was_for_the_labels_and_one_without_labels_to
     page.at_rest(1)
     assert page.numbers == []
     page.score_episode()
+
+
+def test_an_episode_of_a_folder_of_videos_is_scored_as_it_was_for_the_labels(page: Page) -> None:
+    browser, root = page.browser, page.folders[CLIPS]
+    page.open_link("#tab=dataset&dataset=clips&episode=1")
+    browser.until("!document.getElementById('score-episode').disabled")
+    assert browser["episode-told"].text == f"rewound.mp4: {TASK}"
+    browser["score-episode"].click()
+    browser.until_text("scored", "1 of 1 scored")
+    columns = columns_of(root, 1)
+    (row,) = browser.cells("#curves tr")
+    assert (row[1], row[4]) == (TASK, f"{len(columns['index'])} of {len(columns['index'])}")
+    assert [float(text) for text in row[5:7]] == pytest.approx(
+        [columns[name][-1] for name in ("progress_sparse", "success")], abs=2 * SHOWN
+    )
+    run_line(root.parent, browser["command"].text)
+    again = columns_of(root.parent / "clips_episode_1", 1)
+    np.testing.assert_allclose(again["progress_sparse"], columns["progress_sparse"], rtol=0, atol=TOLERANCE)
 
 
 IN_VIEW = """

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from itertools import product
+from itertools import cycle, islice, product
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ import av
 import h5py
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute
 import pytest
 import requests
 from PIL import Image
@@ -33,6 +34,7 @@ from gateway_requests import failure
 from gateways import StandIn, inside, listening
 from labelling import LEROBOT, BrightnessScorer
 from paths import ROOT
+from pictures import turn
 from rfm_client.frames import cached_snapshot, read_video
 from rfm_client.options import ConfigError
 from rfm_labels import LabelOptions, label, open_dataset, read_episode_labels
@@ -124,6 +126,36 @@ def test_a_preview_has_the_first_and_the_last_frame_as_for_the_labels_and_a_few_
     assert "expected one from 0 to" in failure(get("/0/episodes/99/preview"), 404)
 
 
+NAMES = {"grouped": {"motors": ["dx"], "gripper": ["dy"]}, "by position": {"dx": 0, "dy": 1}, "of others": ["dx"]}
+
+
+@pytest.mark.parametrize("kind", [*NAMES, "as stored"])
+def test_actions_and_states_are_those_of_the_rows_under_their_names(tmp_path: Path, kind: str) -> None:
+    root = copied("toy_v30_many", tmp_path)
+    info = json.loads((root / "meta" / "info.json").read_text())
+    info["features"]["action"]["names"] = NAMES.get(kind, ["dx", "dy"])
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    with serving(root) as get:
+        motion = get("/0/episodes/2").json()["motion"]
+        expected = {"action": ["0", "1"] if kind == "of others" else ["dx", "dy"], "state": ["x", "y"]}
+        assert {name: each["names"] for name, each in motion.items()} == expected
+        file = root / "data" / "chunk-000" / "file-000.parquet"
+        table = parquet.read_table(file)
+        of_episode = table.filter(pa.compute.equal(table["episode_index"], 2))
+        for name, column in (("action", "action"), ("state", "observation.state")):
+            assert np.transpose(motion[name]["values"]).tolist() == of_episode[column].to_pylist()
+        place = table.column_names.index("action")
+
+        def answer(*values: Any) -> Any:
+            column = pa.array(list(islice(cycle(values), len(table))))
+            parquet.write_table(table.set_column(place, "action", column), file)
+            return get("/0/episodes/2")
+
+        told = failure(answer([1.0], [1.0, 2.0]), 500)
+        assert "file-000.parquet: action: expected as many numbers in each row" in told
+        assert answer(1.0, 2.0).json()["motion"] == {"state": motion["state"]}
+
+
 def rlds(folder: Path) -> Path:
     return Path(shutil.copytree(ROOT / "tests" / "rlds" / "toy_steps_texts", folder / "rlds"))
 
@@ -175,23 +207,55 @@ def folder_of_videos(folder: Path) -> Path:
     return folder / "videos"
 
 
+def folder_of_old_videos(folder: Path) -> Path:
+    """In a codec that no browser shows."""
+    for file in folder_of_videos(folder).iterdir():
+        encoded_anew(file, "mpeg4", {"q": "1"})
+    return folder / "videos"
+
+
+def folder_of_turned_videos(folder: Path) -> Path:
+    """Recorded upside down."""
+    for file in folder_of_videos(folder).iterdir():
+        turn(file, (-1, 0, 0, -1))
+    return folder / "videos"
+
+
+def at_another_rate(folder: Path) -> str:
+    """A reader that knows the rate better than its videos do."""
+    reader = """
+from rfm_labels import Episode
+
+def episodes(folder):
+    for file in sorted(folder.glob("*.mp4")):
+        yield Episode(file.stem, {"front": file}, fps=10)
+"""
+    (folder / "my_reader.py").write_text(reader)
+    return f"{folder}/my_reader.py:episodes={folder_of_videos(folder)}"
+
+
 def folder_of_hdf5(folder: Path) -> Path:
     return hdf5(folder).parent
 
 
 @pytest.mark.parametrize(
-    "make", [rlds, with_pictures_in_tables, hdf5, folder_of_hdf5, folder_of_videos, by_pattern, by_reader]
+    "make",
+    [
+        *(rlds, with_pictures_in_tables, hdf5, folder_of_hdf5),
+        *(folder_of_videos, folder_of_old_videos, folder_of_turned_videos, at_another_rate, by_pattern, by_reader),
+    ],
 )
-def test_pictures_are_shown_as_a_video(tmp_path: Path, make: Callable[[Path], Path | str]) -> None:
+def test_an_episode_of_any_dataset_is_shown_as_a_video(tmp_path: Path, make: Callable[[Path], Path | str]) -> None:
     root = make(tmp_path)
     (dataset,) = open_to_show(str(root))
-    fps = 5 if make is folder_of_videos else 10
+    fps = 5 if make in (folder_of_videos, folder_of_turned_videos) else 10
+    how = "stored" if make is folder_of_videos else "encoded"
     number, camera = dataset.numbers[1], len(dataset.cameras) - 1
     with serving(root) as get:
         table, curves = get("/0").json(), get(f"/0/episodes/{number}").json()
         video = get(f"/0/episodes/{number}/videos/{camera}")
         faults = get("/0/faults").json()
-    assert (table["cameras"], table["has_stored_pixels"]) == ([*dataset.cameras], False)
+    assert (table["cameras"], video.headers["X-Frames"]) == ([*dataset.cameras], how)
     assert table["left_out"] == dataset.left_out
     assert [row["task"] for row in table["episodes"]] == [episode.task for episode in dataset.episodes]
     assert (curves["curves"], faults) == ([], {})
@@ -482,6 +546,28 @@ def test_labels_that_come_or_change_are_shown_at_once(tmp_path: Path) -> None:
         by_name = get("/0/episodes/5?labels=reward_signals/later.parquet").json()["curves"]
         columns = columns_of(root, 5, "reward_signals/later.parquet")
         np.testing.assert_array_equal(np.float32(by_name[0]["progress"]), columns["reward.later.progress"])
+
+
+def test_names_and_tasks_are_shown_as_they_are_now_and_labels_follow_the_names(tmp_path: Path) -> None:
+    root, given = folder_of_videos(tmp_path), "push the block"
+
+    def rows() -> dict[str, Any]:
+        return {row["name"]: row for row in get("/0").json()["episodes"]}
+
+    with serving(root) as get:
+        assert {name: row["task"] for name, row in rows().items()} == {"0.mp4": "", "1.mp4": ""}
+        (root / "tasks.csv").write_text("video,task\n1.mp4,open the drawer\n0.mp4,close it\n")
+        assert {name: row["task"] for name, row in rows().items()} == {"0.mp4": "close it", "1.mp4": "open the drawer"}
+        (first, *_) = label(open_dataset(root), BrightnessScorer(), LabelOptions()).files  # in the table's order
+        for number, name in enumerate(("1.mp4", "0.mp4")):
+            progress = columns_of(root, number, first.name)["progress_sparse"]
+            assert rows()[name]["final_progress"] == pytest.approx(float(progress[-1]))
+            for part, points in (("", "curves"), ("/preview", "progress")):
+                told = get(f"/0/episodes/{rows()[name]['episode']}{part}").json()[points]
+                assert (told if part else told[0]["progress"]) == pytest.approx(progress.tolist())
+        overridden = open_dataset(root, task=given, override_task=True)
+        label(overridden, BrightnessScorer(), LabelOptions(overwrite=True))
+        assert {row["task"] for row in rows().values()} == {given}
 
 
 def test_labels_of_others_may_lack_success_and_rows_and_tell_which_frames_the_model_skipped(tmp_path: Path) -> None:

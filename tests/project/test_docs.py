@@ -211,7 +211,9 @@ def test_the_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= README_LINES
 
 
-@pytest.mark.parametrize("command", [*found(ANY_COMMAND, DOCUMENTS), *found(IN_A_SCRIPT, DOCUMENTS)])
+@pytest.mark.parametrize(
+    "command", [*found(ANY_COMMAND, DOCUMENTS), *found(IN_A_SCRIPT, [*DOCUMENTS, *ROOT.glob("examples/*.sh")])]
+)
 def test_every_command_line_is_one_that_the_commands_take(command: str) -> None:
     """Parsed by the command itself, not run."""
     words = shlex.split(VARIABLE.sub("1", command.replace("\\\n", " ")))
@@ -238,14 +240,9 @@ def test_every_tensor_of_the_contract_is_documented() -> None:
         assert f"`{spec.name}`" in rows
 
 
-def shown_request() -> dict[str, Any]:
-    (text,) = re.findall(r"^```json\n(.*?)^```", CONTRACT.read_text(), re.MULTILINE | re.DOTALL)
-    request: dict[str, Any] = json.loads(text)
-    return request
-
-
 def test_the_request_of_the_contract_runs(demo_server: Endpoints) -> None:
-    answer = httpx.post(f"{demo_server.http_url}/v2/models/rfm_frames/infer", json=shown_request(), timeout=60)
+    request = json.loads((ROOT / "examples" / "kserve_request.json").read_text())
+    answer = httpx.post(f"{demo_server.http_url}/v2/models/rfm_frames/infer", json=request, timeout=60)
     assert answer.status_code == 200, answer.text
     outputs = {output["name"]: output for output in answer.json()["outputs"]}
     assert outputs["progress"]["shape"] == [2, 3]

@@ -3,15 +3,20 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import rerun
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import Autoreset, RecordEpisodeStatistics, TimeLimit
 
 from coded_env import CodedEnv, Recorder, frame_of
 from environments import MAX_FRAMES, MODEL, TASK, LateClient, assert_close, cart_pole, play, play_on, progress, scores
+from paths import ROOT
+from recordings import logged
 from rfm_client import InvalidSampleError, RewardClient
 from rfm_rl import RewardModelWrapper, RewardOptions, SuccessRule
 from servers import Served
@@ -48,6 +53,22 @@ def test_gymnasium_s_own_check_passes_and_close_closes_only_a_client_that_it_mad
     with served.client("grpc", MODEL) as own:
         RewardModelWrapper(cart_pole(), own, TASK).close()
         assert own.is_ready()
+
+
+def test_the_loop_of_the_guide_logs_the_scores_for_rerun(
+    client: RewardClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    guide = (ROOT / "docs" / "guides" / "reward_an_rl_loop.md").read_text()
+    (loop,) = (code for code in re.findall(r"^```py\n(.*?)^```", guide, re.M | re.S) if "log(" in code)
+    ((before, log),) = re.findall(r"^\| Rerun .*\| `(.*)` \| `(.*)` \|$", guide, re.M)
+    steps = range(LENGTH)
+    code = f"{before}\ndef log(name, value, step): {log}\n{loop.replace('range(1000)', str(steps))}rerun.disconnect()"
+    monkeypatch.chdir(tmp_path)
+    exec(code, {"rerun": rerun, "env": RewardModelWrapper(CodedEnv(0, (LENGTH,)), client, TASK, options())})
+    for key in ("progress", "reward"):
+        times, values = logged(tmp_path / "pole.rrd", "step", f"/reward_model/{key}", "Scalar")
+        assert times == list(steps)
+        assert_close(values, progress(client, VIDEO, [step + 1 for step in steps], None))
 
 
 # Steps that do not wait: the test lets answers come when it wants.

@@ -231,7 +231,7 @@ class Item:
 class Plan:
     """The recipe, and the episodes to label, in frame order.
 
-    dataset: kind, source and revision, for the provenance
+    dataset: kind, source, revision and the caller's task, for the provenance
     horizon: frames over which advantages are taken; None: no advantages
     """
 
@@ -286,7 +286,10 @@ def make_plan(dataset: Dataset, recipe: Recipe, episodes: Iterable[DatasetEpisod
         about += f" {episode.tasks}" if episode.tasks else ""
         videos = [f"{each} {dataset.identity(episode, each)}" for each in recipe.decoded_cameras]
         items.append(Item(episode, digest_of(part.encode() for part in (document, about, *videos))))
-    return Plan(items, recipe, {"kind": dataset.kind, "source": dataset.source, "revision": dataset.revision})
+    described: dict[str, Any] = {"kind": dataset.kind, "source": dataset.source, "revision": dataset.revision}
+    if (given := dataset.given_task).text is not None:
+        described["task"] = {"text": given.text, "overrides": given.overrides}
+    return Plan(items, recipe, described)
 
 
 def _check_progress(rule: ProgressRule | None, checkpoint: CheckpointFacts) -> None:

@@ -126,8 +126,9 @@ def dataset_routes(datasets: Sequence[ShownDataset], limits: BodyLimits) -> APIR
     @router.get("/viewer/datasets/{dataset}/episodes/{episode}/videos/{camera}")
     async def video(request: Request, dataset: int, episode: int, camera: int) -> Response:
         with limits.decoding() as take:
-            clip = await read(request, dataset, lambda shown: shown.video(episode, camera, take))
-        return Response(clip, media_type="video/mp4", headers=_HEADERS)
+            clip, is_stored = await read(request, dataset, lambda shown: shown.video(episode, camera, take))
+        frames = {"X-Frames": "stored" if is_stored else "encoded"}
+        return Response(clip, media_type="video/mp4", headers={**_HEADERS, **frames})
 
     return router
 

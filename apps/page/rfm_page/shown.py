@@ -10,15 +10,13 @@ import base64
 import io
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
-from fractions import Fraction
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-import av
 import numpy as np
 import numpy.typing as npt
 from fastapi import HTTPException
@@ -39,18 +37,18 @@ from rfm_labels import (
     read_provenance,
     summarise,
 )
+from rfm_page.clips import cut, encoded, is_playable
 
 Read = TypeVar("Read")
 
 _SUMMARIES_AT_A_TIME = 8  # summaries in memory
 _POINTS = 32  # in a preview's curve
-_CODING = {"crf": "12", "g": "10", "preset": "veryfast"}  # for H.264: hardly any loss, and fast seeking
 _PREVIEW_PX = (96, 72)  # maximum width and height
 
 
 @dataclass(frozen=True)
 class ShownDataset:
-    """A dataset for the page, whose pictures are encoded as videos.
+    """A dataset for the page. Stored videos are cut; other frames are encoded as videos.
 
     dataset: as ``open_to_show`` returns it
     Methods raise DatasetError for a broken dataset, HTTPException 404 for a missing episode, camera or label file, 409
@@ -75,11 +73,6 @@ class ShownDataset:
             check_links(self.root, links_in(self.root))
 
     @property
-    def has_stored_pixels(self) -> bool:
-        """True if the videos have every pixel as stored; False: some are encoded for the page."""
-        return False
-
-    @property
     def cameras(self) -> Sequence[str]:
         """The cameras whose videos the page shows."""
         return self.dataset.cameras
@@ -94,12 +87,11 @@ class ShownDataset:
         times_s = self.dataset.times_s(episode)
         return np.arange(episode.num_frames) / self.fps if times_s is None else times_s
 
-    def mp4(self, episode: DatasetEpisode, camera: str, take: Callable[[int], object]) -> bytes:
-        """Return an episode's video as an MP4 file. take: see ``video``"""
-        times_s, fps = self.times_s(episode), self.fps
-        if self.dataset.fps is None and len(times_s) > 1:
-            fps = (len(times_s) - 1) / float(times_s[-1])
-        return encoded(self.dataset.whole_frames(episode, camera), fps, take)
+    def rate(self, episode: DatasetEpisode) -> float:
+        """Return an episode's frames per second, on average."""
+        times_s = self.times_s(episode)
+        is_known = self.dataset.fps is not None or len(times_s) < 2
+        return self.fps if is_known else round(float((len(times_s) - 1) / times_s[-1]), 3)
 
     def read(self, reading: Callable[[ShownDataset], Read]) -> Read:
         """Check the dataset, then read from it. Raises HTTPException 500 with the fault of a broken dataset."""
@@ -123,27 +115,28 @@ class ShownDataset:
         """
         file = self._labels(labels)
         status = None if file is None else file.stat()
-        summary = None if file is None or status is None else _summary(file, status.st_mtime_ns)
+        summary = None if file is None else _summary(file, file.stat().st_mtime_ns)[0]
         unused = self.dataset.unused_cameras(self.dataset.cameras)
         rows = {} if summary is None else dict(zip(summary.episodes.tolist(), _rows(summary), strict=True))
+        provenance = None if file is None else read_provenance(file)
+        given = ((provenance or {}).get("dataset") or {}).get("task") or {"text": "", "overrides": False}
         return {
             "labels": None if file is None else self._name_of(file),
             "cameras": list(self.cameras),
-            "has_stored_pixels": self.has_stored_pixels,
             "is_on_hub": self.dataset.revision is not None,
             "unused": [unused.get(camera) for camera in self.cameras],
             "left_out": dict(self.dataset.left_out),
             "corrections": [asdict(self._correction(file, camera)) for camera in self.cameras],
-            "fps": self.fps,
             "threshold": SuccessRule.threshold,
-            "provenance": None if file is None else read_provenance(file),
+            "provenance": provenance,
             "written_s": None if status is None else status.st_mtime,
             "episodes": [
                 {
                     "episode": episode.index,
-                    "task": episode.task,
+                    "name": episode.own_name,
+                    "task": given["text"] if given["overrides"] or not episode.task else episode.task,
                     "num_frames": episode.num_frames,
-                    **rows.get(episode.index, {}),
+                    **({} if file is None else rows.get(self._number_in(file, episode.index), {})),
                 }
                 for episode in self.dataset.listing
             ],
@@ -176,25 +169,38 @@ class ShownDataset:
         return found
 
     def curves(self, number: int, labels: str | None) -> dict[str, Any]:
-        """Return an episode's curves over time."""
+        """Return an episode's curves over time, and its action and state as [D][T]."""
         episode, file = self._episode(number), self._labels(labels)
         times_s = self.times_s(episode)
         times_s = times_s - times_s[0]
-        found = None if file is None else read_episode_labels(file, number)
+        found = None if file is None else read_episode_labels(file, self._number_in(file, number))
         if found is not None and (found.frames.min() < 0 or found.frames.max() >= len(times_s)):
             raise DatasetError.at(f"episode {number}: {file}", f"frames from 0 to {len(times_s) - 1}", "others")
         return {
             "episode": number,
-            "task": episode.task,
+            "fps": self.rate(episode),
             "times_s": times_s.tolist(),
             "curves": [] if found is None else _curves(found, len(times_s)),
+            "motion": {
+                name: {"names": motion.names, "values": motion.values.T.tolist()}
+                for name, motion in self.dataset.motion(episode).items()
+            },
         }
 
-    def video(self, number: int, camera: int, take: Callable[[int], object]) -> bytes:
-        """Return an episode's video as an MP4 file. take: called with a byte count before the bytes are allocated"""
+    def video(self, number: int, camera: int, take: Callable[[int], object]) -> tuple[bytes, bool]:
+        """Return an episode's video as an MP4 file, and True if it has every pixel as stored; False: it was encoded.
+
+        take: called with a byte count before the bytes are allocated
+        """
         if not 0 <= camera < len(self.cameras):
             raise HTTPException(404, f"camera: expected one of {len(self.cameras)} with videos, got {camera}")
-        return self.mp4(self._episode(number), self.cameras[camera], take)
+        episode, name = self._episode(number), self.cameras[camera]
+        span = self.dataset.span(episode, name)
+        if span is not None:
+            off_s = span.times_s - self.times_s(episode)
+            if np.ptp(off_s) <= 2 * span.tolerance_s and is_playable(span):  # else a reader knows another rate
+                return cut(span, take), True
+        return encoded(self.dataset.whole_frames(episode, name), self.rate(episode), take), False
 
     def preview(self, number: int, labels: str | None, take: Callable[[int], object]) -> dict[str, Any]:
         """Return an episode's progress at a few points, and its ``ends`` as JPEG in base64; none: they cannot be read.
@@ -202,7 +208,7 @@ class ShownDataset:
         take: see ``video``
         """
         file = self._labels(labels)
-        found = None if file is None else read_episode_labels(file, self._numbered(number))
+        found = None if file is None else read_episode_labels(file, self._number_in(file, self._numbered(number)))
         progress = None if found is None else found.fused.progress
         if progress is not None:
             places = np.linspace(0, len(progress) - 1, min(_POINTS, len(progress))).round().astype(int)
@@ -220,8 +226,11 @@ class ShownDataset:
         return {"progress": [] if progress is None else progress.tolist(), "pictures": pictures}
 
     def ends(self, episode: DatasetEpisode, camera: str) -> list[UInt8Array]:
-        """Return the first stored frame, and the last where it is read without the others. Raises DatasetError."""
-        return list(itertools.islice(self.dataset.stored_frames(episode, camera), 1))
+        """Return the first stored frame, and of a video the last. Raises DatasetError."""
+        span = self.dataset.span(episode, camera)
+        if span is None:
+            return list(itertools.islice(self.dataset.stored_frames(episode, camera), 1))
+        return [frame for t in (0, -1) for frame in replace(span, times_s=span.times_s[[t]]).frames()]
 
     def _without_folder(self, message: str) -> str:
         """Return a message without the folder's path, for users on other machines."""
@@ -250,6 +259,12 @@ class ShownDataset:
             raise HTTPException(404, f"labels: expected one of {', '.join(files) or 'none'}, got another")
         return None if name is None else files[name]
 
+    def _number_in(self, file: Path, number: int) -> int:
+        """Return an episode's number in a label file; by name, since a folder's numbers change. -1: none."""
+        _, numbers = _summary(file, file.stat().st_mtime_ns)
+        name = self.dataset.episode(number).own_name if numbers else None
+        return number if name is None else numbers.get(name, -1)
+
     def _correction(self, file: Path | None, camera: str) -> Correction:
         """Return how these labels made the camera's frames upright RGB; without labels, how the dataset does now."""
         if file is None:
@@ -265,8 +280,10 @@ class ShownDataset:
 
 
 @lru_cache(_SUMMARIES_AT_A_TIME)
-def _summary(file: Path, _changed_ns: int) -> Summary:
-    return summarise(file)
+def _summary(file: Path, _changed_ns: int) -> tuple[Summary, Mapping[str, int]]:
+    """Return a label file's summary, and the numbers of its episodes with names by name."""
+    summary = summarise(file)
+    return summary, {name: number for number, name in summary.names.items()}
 
 
 def _rows(summary: Summary) -> list[dict[str, Any]]:
@@ -300,32 +317,6 @@ def _scores(curve: Curve, frames: npt.NDArray[np.int64], num_frames: int) -> dic
             of_all[frames] = labelled
             scores[name] = of_all.tolist()
     return scores
-
-
-def encoded(frames: Iterator[UInt8Array], fps: float, take: Callable[[int], object]) -> bytes:
-    """Return pictures as an MP4 file with nearly the same colours.
-
-    frames: uint8 [H, W, 3] each
-    take: called with a byte count before the bytes are allocated
-    """
-    video = io.BytesIO()
-    with av.open(video, "w", format="mp4") as container:
-        stream: Any = None
-        for frame in frames:
-            even = np.pad(frame, [(0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)], "edge")  # for H.264
-            if stream is None:
-                stream = container.add_stream("libx264", Fraction(fps).limit_denominator(1000), options=_CODING)
-                stream.height, stream.width, stream.pix_fmt = *even.shape[:2], "yuv420p"
-                take(even.nbytes)
-            _mux(container, stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")), take)
-        _mux(container, stream.encode(None), take)
-    return video.getvalue()
-
-
-def _mux(container: Any, packets: Sequence[Any], take: Callable[[int], object]) -> None:
-    for packet in packets:
-        take(packet.size)
-        container.mux(packet)
 
 
 def _jpeg(frame: UInt8Array, take: Callable[[int], object]) -> str:

@@ -27,13 +27,13 @@ class VlmConfig(BackboneConfig):
     """The configuration of a checkpoint's network and prompts.
 
     multi_image: each frame is an image; else a trajectory is a video
-    per_frame_progress_token: the state of an image is that of a progress token behind it
-    frame_pooling: pools an image's tokens to its state, without progress tokens; boundary: takes the last token
+    per_frame_progress_token: an image's state is that of a progress token behind it
+    frame_pooling: how an image's tokens become its state without progress tokens; boundary: the last token
     pooling_temperature: temperature of attention pooling
-    average_temporal_patches: in video mode, a temporal patch's tokens are averaged; else the token behind them is read
+    average_temporal_patches: in video mode, averages a temporal patch's tokens; else reads the token behind them
     progress_in_preference: prompts for preference also ask for progress
-    size_px: for videos: height and width to which every frame is resized first; null: each frame keeps its own
-    trained_frames: most frames of a trajectory in training, by default also of clients; None: unknown
+    size_px: for videos: height and width of resized frames; null: each keeps its own
+    trained_frames: most frames of a trajectory in training, and clients' default
     """
 
     multi_image: bool

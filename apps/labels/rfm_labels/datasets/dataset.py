@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
+import numpy.typing as npt
 
 from rfm_client import RewardError, Trajectory, UInt8Array
 from rfm_client.frames import ChannelOrder, Correction, Orientation
 from rfm_client.options import ConfigError, is_blank
 from rfm_labels.datasets.faults import DatasetError, FaultsError, MissingTaskError, UnusedTaskError, require
 from rfm_labels.datasets.hub import DownloadSize
-from rfm_labels.datasets.stored_files import Times
+from rfm_labels.datasets.stored_files import Span, Times
 
 LEAST_SIZE_PX = 8  # per side; a smaller numeric array is no picture
 _WORDS = frozenset(
@@ -141,6 +142,18 @@ class DatasetEpisode:
         tasks = self.tasks or ((0, self.task),)
         ends = [*(first for first, _ in tasks[1:]), self.num_frames]
         return [(task, end - first) for (first, task), end in zip(tasks, ends, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What a robot did or was told to do.
+
+    names: of the D dimensions
+    values: float64 [T, D]
+    """
+
+    names: Sequence[str]
+    values: npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -306,12 +319,20 @@ class Dataset(ABC):
 
     @property
     def listing(self) -> Sequence[DatasetEpisode]:
-        """Like ``episodes``, but a Hub dataset takes them from its metadata and downloads no row table."""
+        """Like ``episodes``, but with the tasks of now, and a Hub dataset downloads no row table."""
         return self.episodes
 
     def times_s(self, episode: DatasetEpisode) -> Times | None:
         """Return frame times from the episode's start, float64 [T]; None: unknown. Raises DatasetError."""
         return None
+
+    def span(self, episode: DatasetEpisode, camera: str) -> Span | None:
+        """Return the episode's frames in the camera's video; None: they are in no video. Raises DatasetError."""
+        return None
+
+    def motion(self, episode: DatasetEpisode) -> Mapping[str, Motion]:
+        """Return the recorded ``action`` and ``state``, as far as the dataset has them. Raises DatasetError."""
+        return {}
 
     def unused_files(self) -> Sequence[Path]:
         """Return files with rows or frames that no episode uses, relative to ``root``; empty for most layouts."""

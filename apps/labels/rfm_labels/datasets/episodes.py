@@ -34,6 +34,7 @@ from rfm_labels.datasets.stored_files import (
     picture_frames,
     turn_mark,
 )
+from rfm_labels.datasets.tasks_table import TABLE, read_table_of_tasks
 
 Frames: TypeAlias = UInt8Array | str | Path | Sequence[str | Path] | Callable[[], Iterable[UInt8Array]]
 
@@ -120,13 +121,15 @@ class _VideoFile(Stored):
     def identity(self) -> str:
         return file_identity(self._file)
 
-    def frames(self) -> Iterator[UInt8Array]:
+    def span(self) -> Span:
         video = self._opened(self._file)
         with faults_at(self._file):
             times_s = video.packets.times_s
         gaps_s = times_s[1:] - times_s[:-1]
-        tolerance_s = 0.5 * float(gaps_s.min()) if len(gaps_s) else 0.5
-        return Span(video, times_s, tolerance_s, self._where).frames()
+        return Span(video, times_s, 0.5 * float(gaps_s.min()) if len(gaps_s) else 0.5, self._where)
+
+    def frames(self) -> Iterator[UInt8Array]:
+        return self.span().frames()
 
 
 class _Pictures(Stored):
@@ -263,3 +266,9 @@ class EpisodeDataset(RecordedDataset):
     def read_episode(self, number: int) -> DatasetEpisode:
         episode = super().read_episode(number)
         return replace(episode, task=" ".join(episode.task.split()))
+
+    @property
+    def listing(self) -> Sequence[DatasetEpisode]:
+        table = self.root / TABLE
+        tasks = read_table_of_tasks(table, has_tasks=False) if table.is_file() else {}
+        return [replace(each, task=tasks.get(each.name) or each.task) for each in self.episodes]

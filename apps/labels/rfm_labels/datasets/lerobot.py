@@ -6,6 +6,7 @@ Frame t belongs to row t; in a video, it is the frame at the row's time.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -13,10 +14,12 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rfm_client import UInt8Array
 from rfm_client.frames import Picture, Video
 from rfm_client.options import InvalidValueError, checked_finite
-from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, TaskOverride
+from rfm_labels.datasets.dataset import AskedCorrections, Dataset, DatasetEpisode, Motion, TaskOverride
 from rfm_labels.datasets.faults import DatasetError, listed, require
 from rfm_labels.datasets.hub import DownloadSize, HubFiles
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S, Frames, Part, VideoRows
@@ -44,6 +47,8 @@ from rfm_labels.datasets.stored_files import (
 _VIDEOS_AT_A_TIME = 4  # packets of this many videos, or one per camera, stay in memory
 _CONTAINER = {".mp4": "mov"}  # FFmpeg's names by suffix. Otherwise FFmpeg would open the files that a playlist names
 _LISTED_IN = dict.fromkeys(("v2.0", "v2.1"), EPISODES_FILE) | {"v3.0": EPISODES_FOLDER}
+_MOTION = {"action": "action", "state": "observation.state"}  # columns
+_VECTORS = re.compile(r"(fixed_size_|large_)?list<\w+: (halffloat|float|double|u?int\d+)( not null)?>(\[\d+\])?")
 _BY_PLACE = "LeRobot finds a sentence by position, so it may read a different one"
 
 
@@ -194,15 +199,34 @@ class LeRobotDataset(Dataset):
             check_pictures(self._images(episode, camera), self.place(episode, camera))
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        if camera in self.info.videos:
-            return self.span(episode, camera).frames()
+        span = self.span(episode, camera)
+        if span is not None:
+            return span.frames()
         return picture_frames(self._images(episode, camera), self.place(episode, camera))
 
     def times_s(self, episode: DatasetEpisode) -> Times:
         return self._rows.read(self._entry(episode.index)).times_s
 
-    def span(self, episode: DatasetEpisode, camera: str) -> Span:
-        """Return the episode's frames in the camera's video. Raises DatasetError if a row has no frame of its own."""
+    def motion(self, episode: DatasetEpisode) -> Mapping[str, Motion]:
+        file = self._rows.file_of(self._entry(episode.index))
+        types = column_types(file)
+        columns = {name: column for name, column in _MOTION.items() if _VECTORS.fullmatch(types.get(column, ""))}
+        own = [("episode_index", "=", episode.index)]
+        table = read_table(file, list(columns.values()), own) if columns else {}
+        found = {}
+        for name, column in columns.items():
+            try:
+                values = np.stack(table[column].to_numpy()).astype(np.float64)
+            except ValueError as error:
+                raise DatasetError.at(f"{file}: {column}", "as many numbers in each row", error) from error
+            names = self.info.names.get(column, [])
+            usual = list(map(str, range(values.shape[1])))
+            found[name] = Motion(names if len(names) == len(usual) else usual, values)
+        return found
+
+    def span(self, episode: DatasetEpisode, camera: str) -> Span | None:
+        if camera not in self.info.videos:
+            return None
         rows, frames = self._frames_of(episode, camera)
         tolerance_s = 0.5 * rows.apart_s(frames)
         return Span(rows.video, rows.video.packets.times_s[frames], tolerance_s, self.place(episode, camera))

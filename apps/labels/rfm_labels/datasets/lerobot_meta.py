@@ -41,6 +41,7 @@ class Info:
     left_out: other cameras, with the reason
     total_frames: over all episodes
     data_path, video_path: file path templates
+    names: of the dimensions, by feature; empty if unknown
     notes: lines for the caller
     """
 
@@ -56,6 +57,7 @@ class Info:
     chunks_size: int
     data_path: str
     video_path: str | None
+    names: Mapping[str, Sequence[str]]
     notes: Sequence[str]
 
     @classmethod
@@ -97,6 +99,7 @@ class Info:
             chunks_size=field("chunks_size", int),
             data_path=field("data_path", str),
             video_path=field("video_path", str) if videos else None,
+            names={key: _names(feature.get("names")) for key, feature in features.items()},
             notes=notes,
         )
 
@@ -109,6 +112,14 @@ class Info:
         is_inside = bool(path) and not Path(path).is_absolute() and ".." not in Path(path).parts
         require(INFO_FILE, is_inside, "a path inside the dataset", repr(path))
         return self.root / path
+
+
+def _names(stored: Any) -> list[str]:
+    """The names of a feature's dimensions, which LeRobot's versions store as a list, in groups, or with positions."""
+    if isinstance(stored, dict):
+        groups = [group for group in stored.values() if isinstance(group, list)]
+        stored = [name for group in groups for name in group] if groups else list(stored)
+    return list(map(str, stored)) if isinstance(stored, list) else []
 
 
 def _is_depth(feature: Mapping[str, Any]) -> bool:

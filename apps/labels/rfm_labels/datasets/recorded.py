@@ -11,7 +11,7 @@ from typing import Any
 from rfm_client import RewardError, UInt8Array
 from rfm_labels.datasets.dataset import CountedDataset, DatasetEpisode
 from rfm_labels.datasets.faults import DatasetError, FaultsError, require
-from rfm_labels.datasets.stored_files import Times
+from rfm_labels.datasets.stored_files import Span, Times
 
 
 class Stored(ABC):
@@ -29,6 +29,10 @@ class Stored(ABC):
     @abstractmethod
     def frames(self) -> Iterator[UInt8Array]:
         """Yield the frames, as ``Dataset.stored_frames``."""
+
+    def span(self) -> Span | None:
+        """Return the frames in their video, as ``Dataset.span``."""
+        return None
 
     @property
     def times_s(self) -> Times | None:
@@ -151,6 +155,9 @@ class RecordedDataset(CountedDataset):
         expected = f"{episode.num_frames} frames, as the other cameras"
         require(self.place(episode, camera), stored.count == episode.num_frames, expected, got)
         stored.check()
+
+    def span(self, episode: DatasetEpisode, camera: str) -> Span | None:
+        return self.recorded[episode.index].cameras[camera].span()
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         return self.recorded[episode.index].cameras[camera].frames()

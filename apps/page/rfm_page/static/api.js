@@ -83,9 +83,10 @@ export async function previewOf(number, episode, labels, signal) {
   return (await answer(`viewer/datasets/${number}/episodes/${episode}/preview${chosen(labels)}`, { signal })).json();
 }
 
-/** The video of an episode by one camera, as a Blob: an address of its own could not show the key. */
+/** The video of an episode by one camera, as a Blob, since an address of its own could not show the key, and whether every pixel is as stored. */
 export async function videoOf(number, episode, camera, signal) {
-  return (await answer(`viewer/datasets/${number}/episodes/${episode}/videos/${camera}`, { signal })).blob();
+  const response = await answer(`viewer/datasets/${number}/episodes/${episode}/videos/${camera}`, { signal });
+  return { blob: await response.blob(), isStored: response.headers.get("X-Frames") === "stored" };
 }
 
 /** A clip that comes with the gateway, as a Blob. */

@@ -7,10 +7,10 @@ import { sampleOf } from "./svg.js";
 import { signed } from "./text.js";
 import uPlot from "./uplot/uPlot.esm.js";
 
-const NUM_COLOURS = 12;
+export const NUM_COLOURS = 12;
 const LEFT_PX = 60; // of the numbers and names to the left
 const VALUE_PX = 16; // height of a number beside the chart
-const RIGHT_PX = { one: 48, several: 64 }; // of the numbers to the right; of several curves each with a piece of its line
+const RIGHT_PX = 64; // of the numbers to the right; of several curves each with a piece of its line
 const STUB_PX = 12; // length of such a piece
 const MOST_VALUES = 6; // of more curves those of one colour have numbers
 export const MARK_PX = 72; // at least between the marks of the axis below
@@ -65,11 +65,13 @@ export function heightOf(panes, signal, value) {
 /**
  * A chart in `host`. `onTime(seconds, isDragged)` is called when somebody points at it or drags in it.
  * onThreshold(value): somebody drags the line at which success counts
+ * onView(view): somebody zooms or pans, as `look` takes it
  */
 export class Chart {
   #host;
   #onTime;
   #onThreshold;
+  #onView;
   #plot = null;
   #curves = [];
   #panes = panesOf([]);
@@ -85,10 +87,11 @@ export class Chart {
   #dots = made("dots");
   #resizing = new ResizeObserver(() => this.#host.clientWidth && this.#plot?.setSize(this.#size()));
 
-  constructor(host, onTime, { onThreshold = null } = {}) {
+  constructor(host, onTime, { onThreshold = null, onView = () => {} } = {}) {
     this.#host = host;
     this.#onTime = onTime;
     this.#onThreshold = onThreshold;
+    this.#onView = onView;
     this.#line.classList.toggle("movable", onThreshold !== null);
     this.#resizing.observe(host);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.redraw());
@@ -112,7 +115,7 @@ export class Chart {
       curve.times, ...signals.map((signal) => curve.times.map((_, index) => heightOf(this.#panes, signal, curve[signal]?.[index]))),
     ]);
     const data = tables.length ? uPlot.join(tables) : [[], []];
-    const shape = `${JSON.stringify(this.#panes)} ${this.#isLow} ${this.#rightPx} ${JSON.stringify(this.#curves.map(({ dash, skipsFrames }) => [dash, skipsFrames]))}`;
+    const shape = `${JSON.stringify(this.#panes)} ${this.#isLow} ${JSON.stringify(this.#curves.map(({ dash, skipsFrames }) => [dash, skipsFrames]))}`;
     if (shape !== this.#shape || !this.#plot) {
       this.#plot?.destroy();
       this.#plot = this.#curves.length ? this.#newPlot(signals, data) : null;
@@ -159,8 +162,9 @@ export class Chart {
       return { curve, signal, time: curve.times[index], value: index === null ? null : curve[signal]?.[index] };
     })).filter(({ value }) => value !== null && value !== undefined);
     for (const point of points) point.top = this.#top(point.signal, point.value);
-    this.#dots.replaceChildren(...points.map((point) => this.#dot(point)).reverse()); // as the lines: the first one on top
     const chosen = this.#chosen(points);
+    const named = chosen.length < points.length ? chosen : [];
+    this.#dots.replaceChildren(...points.map((point) => this.#dot(point, named.includes(point))).reverse()); // as the lines: the first one on top
     const numbers = Object.entries(this.#panes).flatMap(([signal, { scale }]) => {
       const [lowest, highest] = scale.map((value) => this.#top(signal, value));
       return apart(chosen.filter((point) => point.signal === signal), highest - VALUE_PX / 2, lowest + VALUE_PX / 2);
@@ -190,16 +194,13 @@ export class Chart {
     return this.#curves.length > 1;
   }
 
-  /** The point of a curve that a number tells. */
-  #dot({ curve, time, top }) {
+  /** The point of a curve that a number tells. isNamed: of many curves, this has a number */
+  #dot({ curve, time, top }, isNamed) {
     const element = document.createElement("i");
+    if (isNamed) element.dataset.name = curve.label;
     element.style.background = colourOf(curve);
     element.style.transform = `translate(${this.#plot.valToPos(time, "x").toFixed(1)}px, ${top.toFixed(1)}px)`;
     return element;
-  }
-
-  get #rightPx() {
-    return this.#hasSeveral || this.#onThreshold ? RIGHT_PX.several : RIGHT_PX.one; // the slider is as wide as a chart with a threshold
   }
 
   get #isLow() {
@@ -244,7 +245,7 @@ export class Chart {
     }));
     const options = {
       ...this.#size(),
-      padding: [4, this.#rightPx, 4, 0],
+      padding: [4, RIGHT_PX, 4, 0],
       legend: { show: false },
       cursor: { x: false, y: false, points: { show: false }, drag: { x: false, y: false } },
       scales: { x: { time: false, range: () => this.#view ?? [0, this.#end] }, y: { range: [0, 1] } },
@@ -276,12 +277,13 @@ export class Chart {
     const length = Math.min(Math.max((to - from) * zoom, this.#end / MOST_ZOOM), this.#end);
     const moved = event.ctrlKey ? share * (to - from - length) : ((event.deltaX || event.deltaY) / width) * length;
     const begin = Math.min(Math.max(from + moved, 0), this.#end - length);
-    this.#look(length < this.#end ? [begin, begin + length] : null);
+    this.#onView(length < this.#end ? [begin, begin + length] : null);
   }
 
-  #look(view) {
+  /** Shows a part of the time. view: from and to, seconds; null: all */
+  look(view) {
     this.#view = view;
-    this.#plot.setData(this.#plot.data);
+    this.#plot?.batch((plot) => plot.setData(plot.data)); // at once, since the line stands on the new scale
     this.moveTo(this.#time);
   }
 
@@ -298,7 +300,7 @@ export class Chart {
     });
     plot.over.addEventListener("pointermove", tell);
     plot.over.addEventListener("wheel", (event) => this.#turned(event, plot), { passive: false });
-    plot.over.addEventListener("dblclick", () => this.#look(null));
+    plot.over.addEventListener("dblclick", () => this.#onView(null));
     this.#line.onpointerdown = (event) => {
       if (!this.#onThreshold) return;
       event.stopPropagation();

@@ -3,12 +3,12 @@
 
 import { curvesOf, datasets, episodesOf, faultsOf, missingOf, previewOf, videoOf } from "./api.js";
 import { Asking } from "./asking.js";
-import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, UNDONE, WORST_FIRST } from "./episodes.js";
+import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, toldOf, UNDONE, WORST_FIRST } from "./episodes.js";
 import { deadLink, downloading, failure, noDataset, noEpisode, noHit, noVideo } from "./faults.js";
 import { episodesJson, episodesText, lerobotWords } from "./exports.js";
 import { Histogram } from "./histogram.js";
 import { onKeys } from "./keys.js";
-import { DASHES, namedLine } from "./looks.js";
+import { DASHES, lookOf, namedLine } from "./looks.js";
 import { Previews } from "./previews.js";
 import { Place } from "./states.js";
 import { save } from "./takeaway.js";
@@ -20,7 +20,6 @@ const MOST_LETTERS = 400; // that are shown of words for LeRobot: thousands of n
 const NARROW = "(max-width: 719px)";
 const NOTHING = {
   episodes: [], cameras: [], unused: [], corrections: [], left_out: {}, threshold: 0.5, provenance: null, written_s: null,
-  has_stored_pixels: true,
 };
 
 export class DatasetTab {
@@ -72,8 +71,8 @@ export class DatasetTab {
       onChoose: () => this.#showChosen(),
     });
     const elements = {
-      videos: page["episode-videos"], chart: page["episode-chart"], slider: page["episode-time"], button: page["episode-play"],
-      told: page["episode-time-told"],
+      videos: page["episode-videos"], chart: page["episode-chart"], motion: page["motion-chart"], slider: page["episode-time"],
+      button: page["episode-play"], told: page["episode-time-told"],
     };
     this.#timeline = new Timeline(elements, { onThreshold: (value) => { this.#cutAt(value); this.#onShown(false); } });
     this.#listen();
@@ -466,7 +465,7 @@ export class DatasetTab {
     page.datasets.classList.add("watching");
     this.#table.mark(episode.episode, this.#shown);
     page["episode-title"].textContent = `Episode ${episode.episode}`;
-    page["episode-told"].textContent = page["episode-told"].title = episode.task;
+    page["episode-told"].textContent = page["episode-told"].title = toldOf(episode);
     const place = this.#shown.findIndex((each) => each.episode === episode.episode);
     page["episode-before"].disabled = place <= 0;
     page["episode-after"].disabled = place < 0 || place === this.#shown.length - 1;
@@ -486,6 +485,7 @@ export class DatasetTab {
     const { size, asks } = await missingOf(this.#number, episode, signal);
     if (size === null || signal.aborted) return;
     this.#timeline.show([]);
+    this.#page.motion.hidden = true;
     if (asks) await new Promise((accept) => place.show(downloading(episode, size, accept)));
     if (signal.aborted) return;
     place.show(downloading(episode, size));
@@ -495,39 +495,45 @@ export class DatasetTab {
 
   async #fetch({ episode }, signal) {
     const { cameras, unused, corrections } = this.#told;
-    const other = this.#page.others.value;
+    const page = this.#page;
+    const other = page.others.value;
     const names = [this.#labels, ...(other ? [other] : [])];
     await this.#download(episode, signal);
     if (this.#told.is_on_hub) this.#table.refill(episode); // also after a download that went on without the page
     const told = await Promise.all(names.map((name) => curvesOf(this.#number, episode, name, signal)));
     const curves = [...curvesIn(told[0], null), ...told.slice(1).flatMap((each) => curvesIn(each, other).slice(0, 1))];
     this.#timeline.time = 0;
-    this.#timeline.show(curves.length ? curves : [emptyCurve(told[0])]);
-    this.#page["episode-chart"].setAttribute("aria-label", describe(curves));
-    this.#page["episode-legend"].replaceChildren(...curves.map(namedLine));
-    const blobs = await Promise.all(cameras.map((_, camera) => videoOf(this.#number, episode, camera, signal)));
+    const motion = motionIn(told[0]);
+    page.motion.hidden = !motion.length;
+    page["motion-legend"].replaceChildren(...new Map(motion.map((curve) => [curve.label, namedLine(curve)])).values());
+    this.#timeline.show(curves.length ? curves : [emptyCurve(told[0])], motion);
+    page["episode-chart"].setAttribute("aria-label", describe(curves));
+    page["episode-legend"].replaceChildren(...curves.map(namedLine));
+    this.#watched.fps = told[0].fps;
+    const found = await Promise.all(cameras.map((_, camera) => videoOf(this.#number, episode, camera, signal)));
     if (signal.aborted) return;
     if (!cameras.length) this.#places.episode.show(noVideo(() => this.#watch(this.#watched)));
     const name = this.#datasets[this.#number].name.replace("/", "_"); // of the Hub
     cameras.forEach((camera, index) => {
       const file = `${name}_episode_${`${episode}`.padStart(6, "0")}.${short(camera)}.mp4`;
-      this.#watched.files.push(new File([blobs[index]], file, { type: blobs[index].type }));
+      this.#watched.files.push(new File([found[index].blob], file, { type: found[index].blob.type }));
       const title = unused[index] ? `${short(camera)} (${unused[index]}: not scored)` : short(camera);
       const video = this.#timeline.videos.add(this.#watched.files.at(-1), title, corrections[index]);
       this.#timeline.videos.mark(video, curves.find(({ label }) => label === short(camera)));
     });
-    const reason = !this.#told.has_stored_pixels
-      ? "Off: the page encodes these frames for the browser, which changes their scores slightly. Use rfm-client label."
-      : unused.every(Boolean) ? "Off: no camera of this episode has colours" : ""; // of no camera, too
+    const reason = unused.every(Boolean) ? "Off: no camera of this episode has colours" // of no camera, too
+      : found.some(({ isStored }, index) => !isStored && !unused[index])
+        ? "Off: the page encodes these frames for the browser, which changes their scores slightly. Use rfm-client label." : "";
     Object.assign(this.#page["score-episode"], { disabled: reason !== "", title: reason });
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) this.#timeline.videos.play();
   }
 
   #score() {
     this.#timeline.videos.pause();
-    const { fps, corrections, cameras, unused } = this.#told;
-    const { files, task, episode } = this.#watched;
-    const origins = cameras.map((camera) => ({ dataset: this.#datasets[this.#number].name, episode, camera, fps, task }));
+    const { corrections, cameras, unused } = this.#told;
+    const { files, fps, task, episode } = this.#watched;
+    const own = this.#told.provenance?.dataset?.task ? null : task; // else the command has to give it
+    const origins = cameras.map((camera) => ({ dataset: this.#datasets[this.#number].name, episode, camera, fps, task: own }));
     const used = (each) => each.filter((_, index) => !unused[index]);
     this.#onScore({ files: used(files), task, fps, corrections: used(corrections), origins: used(origins) });
   }
@@ -541,6 +547,14 @@ function curvesIn({ times_s: times, curves }, file) {
     const label = file === null ? name : `${name} (${reward(file)})`;
     return { index, label, progress, success: success ?? none, answered, times, allTimes: times, dash: file === null ? null : DASHES[1] };
   });
+}
+
+/** The robot's actions and states as a chart takes them: dimensions of one name have one colour. */
+function motionIn({ times_s: times, motion }) {
+  const names = [...new Set(Object.values(motion).flatMap(({ names: own }) => own))];
+  const success = times.map(() => null);
+  return Object.entries(motion).flatMap(([leading, { names: own, values }]) => values.map((each, place) => (
+    { ...lookOf(names.indexOf(own[place])), label: own[place], leading, [leading]: each, success, times, allTimes: times })));
 }
 
 /** A curve without a number, so that there is a time to move in. */

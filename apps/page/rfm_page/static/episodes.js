@@ -55,11 +55,16 @@ export function judged(episodes, threshold, others) {
   });
 }
 
-/** Those that every filter keeps. chosen: [name, number] of each filter; task: a part of the task */
-export function kept(episodes, chosen, task) {
-  const part = task.trim().toLowerCase();
+/** The name of an episode, if it has one, and its task. */
+export function toldOf({ name, task }) {
+  return [name, task].filter(Boolean).join(": ");
+}
+
+/** Those that every filter keeps. chosen: [name, number] of each filter; text: a part of the name or the task */
+export function kept(episodes, chosen, text) {
+  const part = text.trim().toLowerCase();
   return episodes.filter((episode) =>
-    episode.task.toLowerCase().includes(part) && chosen.every(([name, number]) => FILTERS[name](episode, number)));
+    toldOf(episode).toLowerCase().includes(part) && chosen.every(([name, number]) => FILTERS[name](episode, number)));
 }
 
 /** The episodes in an order; those of which nothing is known come last. */
@@ -146,7 +151,7 @@ export class EpisodeTable {
     first.addEventListener("click", (event) => event.stopPropagation());
     const task = cell("", "task");
     const words = document.createElement("span");
-    words.textContent = task.title = episode.task;
+    words.textContent = task.title = toldOf(episode);
     task.append(words);
     if (episode.fault) {
       const fault = document.createElement("span");

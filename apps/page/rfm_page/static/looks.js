@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 // What curves look like: a colour for each video, and a line for each question, so that no two look alike.
 
-import { colourName } from "./chart.js";
+import { colourName, NUM_COLOURS } from "./chart.js";
 import { questionsOf } from "./curves.js";
 import { sampleOf } from "./svg.js";
 
@@ -23,6 +23,11 @@ export function giveLooks(curves) {
 /** Whether colours tell questions apart, since there is only one video. */
 export function byQuestion(curves, questions = questionsOf(curves)) {
   return questions.length > 1 && new Set(curves.map(({ video }) => video)).size === 1;
+}
+
+/** The colour and the line of the curve with this number where no two look alike. */
+export function lookOf(index) {
+  return { index, dash: DASHES[Math.floor(index / NUM_COLOURS) % DASHES.length] };
 }
 
 /** An item of a legend: a piece of a curve's line, and its label. */

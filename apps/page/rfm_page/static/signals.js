@@ -4,13 +4,18 @@
 import { NONE, shown } from "./text.js";
 
 const ROUNDING = 0.005; // by which a score may leave its bounds unseen
+const ROUNDED = 1e-6; // of a number, by which another one is the same
 const MOST_MARKS = { few: 3, usual: 5 };
 const SHARE_MARKS = {
   progress: { few: [0, 0.5, 1], usual: [0, 0.25, 0.5, 0.75, 1] },
   success: { few: [0, 1], usual: [0, 0.5, 1] },
 };
 const SHARE = { unit: "", bounds: [0, 1] };
-const known = { progress: { short: "progress", ...SHARE }, success: { short: "success", ...SHARE } };
+const OPEN = { unit: "", bounds: [] };
+const known = {
+  progress: { short: "progress", ...SHARE }, success: { short: "success", ...SHARE },
+  action: { short: "action", ...OPEN }, state: { short: "state", ...OPEN }, // of the robot
+};
 
 /** Takes over what the gateway tells of scores: for each by name `short`, `unit` and `bounds`. */
 export function learn(scores) {
@@ -33,9 +38,11 @@ function shortOf(signal) {
   return known[signal].short;
 }
 
-/** A number of a score without the unit: seconds to a tenth, shares to a thousandth. */
+/** A number of a score without the unit: seconds to a tenth, shares to a thousandth, others to four digits. */
 export function numberOf(signal, value) {
-  return known[signal].unit ? shown(value, 1) : shown(value);
+  const { unit, bounds } = known[signal];
+  const digits = bounds.length ? 3 : 3 - Math.min(Math.floor(Math.log10(Math.max(Math.abs(value), 1))), 3);
+  return shown(value, unit ? 1 : digits);
 }
 
 /** A number of a score, with the unit. */
@@ -58,14 +65,19 @@ export function columnOf(signals) {
   return { title: "score", text: (signal, value) => (shown(value) === NONE ? NONE : text(signal, value)) };
 }
 
-/** The smallest and the largest number on the axis of a score: its bounds with 0, or further where curves leave them, as those of Robo-Dopamine may. */
+/**
+ * The smallest and the largest number on the axis of a score: its bounds with 0, or further where curves leave them, as
+ * those of Robo-Dopamine may. Without bounds: those of the curves.
+ */
 export function scaleOf(signal, curves) {
   const bounds = known[signal].bounds.filter((bound) => bound !== null);
   const values = curves.flatMap((curve) => curve[signal] ?? []).filter((value) => value !== null);
-  const [low, high] = values.reduce(([least, most], value) => [Math.min(least, value), Math.max(most, value)], [Math.min(0, ...bounds), Math.max(0, ...bounds)]);
+  const [first = 0] = bounds.length ? [] : values;
+  const [low, high] = values.reduce(([least, most], value) => [Math.min(least, value), Math.max(most, value)], [Math.min(first, ...bounds), Math.max(first, ...bounds)]);
   if (bounds.length === 2 && low > bounds[0] - ROUNDING && high < bounds[1] + ROUNDING) return bounds;
   const step = stepOf(low, high, MOST_MARKS.usual);
-  return [Math.floor(low / step) * step, Math.ceil(high / step) * step || step];
+  const bottom = Math.floor(low / step) * step;
+  return [bottom, Math.max(Math.ceil(high / step) * step, bottom + step)];
 }
 
 /** The numbers that stand beside an axis. kind: few or usual */
@@ -78,7 +90,7 @@ export function marksOf(signal, [low, high], kind) {
 
 /** A round distance of which at most `most` lie between two numbers. */
 function stepOf(low, high, most) {
-  const span = high - low || 1;
+  const span = Math.max(high - low, ROUNDED * Math.max(Math.abs(low), Math.abs(high))) || 1;
   const power = 10 ** Math.floor(Math.log10(span / most));
   return [1, 2, 5, 10].map((digit) => digit * power).find((each) => span / each <= most + 1e-9);
 }

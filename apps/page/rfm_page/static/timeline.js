@@ -11,7 +11,7 @@ const KEYS = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1 };
 const NEAR_S = 1e-3;
 
 /**
- * elements: `videos` and `chart` hold what is shown, `slider` is an input, `button` plays and pauses,
+ * elements: `videos`, `chart` and perhaps `motion` hold what is shown, `slider` is an input, `button` plays and pauses,
  * `told` says the time
  * changing: of the videos, as `Videos` takes it; chartOptions: as `Chart` takes them
  */
@@ -20,11 +20,15 @@ export class Timeline {
   #button;
   #told;
   #curves = [];
+  #charts;
   time = 0;
 
-  constructor({ videos, chart, slider, button, told }, { changing = null, ...chartOptions } = {}) {
+  constructor({ videos, chart, motion = null, slider, button, told }, { changing = null, ...chartOptions } = {}) {
     this.videos = new Videos(videos, (seconds, video) => this.moveTo(seconds, video), changing);
-    this.chart = new Chart(chart, (seconds, isDragged) => this.#pointedAt(seconds, isDragged), chartOptions);
+    const onView = (view) => { for (const each of this.#charts) each.look(view); };
+    this.#charts = [chart, motion].filter(Boolean).map((host, place) =>
+      new Chart(host, (seconds, isDragged) => this.#pointedAt(seconds, isDragged), place ? { onView } : { ...chartOptions, onView }));
+    [this.chart] = this.#charts;
     this.#slider = slider;
     this.#button = button;
     this.#told = told;
@@ -36,10 +40,10 @@ export class Timeline {
     slider.addEventListener("keydown", (event) => this.#pressed(event));
   }
 
-  /** Draws the curves, and lets the controls reach the end of them. */
-  show(curves) {
+  /** Draws the curves, and lets the controls reach the end of them. motion: curves of the robot, beside them */
+  show(curves, motion = []) {
     this.#curves = curves.map(answeredOf).filter(({ times }) => times.length);
-    this.chart.show(this.#curves);
+    [this.#curves, motion].forEach((each, place) => this.#charts[place]?.show(each));
     this.#slider.disabled = this.#button.disabled = !this.#curves.length;
     this.#slider.max = Math.max(0, ...this.#curves.map(({ allTimes }) => allTimes.at(-1))) || 1;
     this.#showTime();
@@ -58,7 +62,7 @@ export class Timeline {
     this.#slider.value = this.time;
     this.#told.textContent = this.#slider.disabled ? "" : `${this.time.toFixed(2)} / ${Number(this.#slider.max).toFixed(2)} s`;
     this.#slider.setAttribute("aria-valuetext", [`${this.time.toFixed(2)} seconds`, ...this.#numbers()].join("; "));
-    this.chart.moveTo(this.time);
+    for (const chart of this.#charts) chart.moveTo(this.time);
   }
 
   /** What stands beside the lines, for somebody who hears the page. */
