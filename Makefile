@@ -12,7 +12,7 @@ WORKERS := --dist loadgroup --no-loadscope-reorder
 TOOL := PYTHONPATH=tests/support:tools $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
-.PHONY: help demo install test fast test-more test-all nightly test-newest lint check types parity bench gpu gpu-packages perf chaos soak format model_repository \
+.PHONY: help demo install test fast test-more test-all nightly test-newest lint check types bench gpu gpu-packages perf chaos soak format model_repository \
   clean ops-check ops-tools audit lock mutate docs reference version
 
 # What can be made: this list.
@@ -77,10 +77,6 @@ check: lint types
 # Types alone.
 types: $(INSTALLED)
 	$(BIN)/mypy
-
-# How far the scores are from the original's: every reference case, through Triton.
-parity: $(INSTALLED)
-	$(TOOL) tools/parity.py
 
 # Measure this server beside the bare engine, the FastAPI server's design and mosec.
 bench: $(INSTALLED)

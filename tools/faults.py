@@ -162,11 +162,8 @@ class Site:
 
 
 @contextmanager
-def site(folder: Path, export: Callable[[Path], object] | None = None, *, to: Path | None = None) -> Iterator[Site]:
-    """Start a server for one fault. A shared server would restart six times in a row, which counts as a crash loop.
-
-    to: as in ``serving``
-    """
+def site(folder: Path, export: Callable[[Path], object] | None = None) -> Iterator[Site]:
+    """Start a server for one fault. A shared server would restart six times in a row, which counts as a crash loop."""
     folder.mkdir()
     repository, key_file, config = folder / "model_repository", folder / "key", folder / "serve.yaml"
     (export or (lambda repository: export_faulty(repository, folder)))(repository)
@@ -175,7 +172,7 @@ def site(folder: Path, export: Callable[[Path], object] | None = None, *, to: Pa
     config.write_text(f"serve: {{hang_s: {HANG_S}}}\n")
     port = Endpoints.free().http_port
     options = f"--gateway-port={port}", f"--admin-key-file={key_file}", f"--config={config}"
-    with serving(repository, *options, to=to) as served:
+    with serving(repository, *options) as served:
         start_s = served.wait_ready()
         exams = [Exam.of(CHECKPOINT, mixed=mixed) for mixed in (True, False)]
         made = Site(served, f"http://127.0.0.1:{port}", folder, start_s, *exams)
@@ -322,33 +319,23 @@ def kill_serve(site: Site) -> list[Row]:
     return [row]
 
 
-def full_disk(healthy: Site) -> list[Row]:
-    """Kill Triton while ``rfm serve`` cannot write for lack of disk space."""
-    kill = signalled(TRITON, signal.SIGKILL)
-    with site(healthy.folder / "full_disk", to=Path("/dev/full")) as without_room:
-        return healed("kill -9 of Triton, no room for the log", kill, TRITON)(without_room)
-
-
 def dead_load(site: Site) -> list[Row]:
-    """Roll out a half-copied version, and one whose process dies before the handshake with Triton."""
-    rows, repository = [], site.folder / "model_repository"
-    for name, program in {"a version without model.py": None, "a process that dies as it loads": DIES}.items():
-        version = str(rfm_export.export(CHECKPOINT, repository, ExportConfig(num_gpus=0, torch_threads=1)))
-        file = repository / MODEL / version / MODEL_FILE
-        file.unlink() if program is None else file.write_text(program)
-        before, began_s = site.restarts(MODEL), time.monotonic()
-        with site.callers() as callers:
-            with suppress(RuntimeError):
-                site.models("rollout", MODEL, version)
-                raise AssertionError(f"{name}: expected the rollout to fail")
-            took_s = time.monotonic() - began_s
-            site.served.wait_ready()
-            callers.wait_for_all()
-        told = f"the rollout failed after {took_s:.1f} s; {site.restarts(MODEL) - before:.0f} restarts"
-        row = Row(f"rollout of {name}", callers, took_s, told)
-        row.expect(took_s <= HEALED_S + 2 * site.start_s, f"the rollout took {took_s:.1f} s")
-        rows.append(row)
-    return rows
+    """Roll out a version whose process dies before the handshake with Triton. Half-copied ones are not loaded."""
+    repository = site.folder / "model_repository"
+    version = str(rfm_export.export(CHECKPOINT, repository, ExportConfig(num_gpus=0, torch_threads=1)))
+    (repository / MODEL / version / MODEL_FILE).write_text(DIES)
+    before, began_s = site.restarts(MODEL), time.monotonic()
+    with site.callers() as callers:
+        with suppress(RuntimeError):
+            site.models("rollout", MODEL, version)
+            raise AssertionError("expected the rollout to fail")
+        took_s = time.monotonic() - began_s
+        site.served.wait_ready()
+        callers.wait_for_all()
+    told = f"the rollout failed after {took_s:.1f} s; {site.restarts(MODEL) - before:.0f} restarts"
+    row = Row("rollout of a process that dies as it loads", callers, took_s, told)
+    row.expect(took_s <= HEALED_S + 2 * site.start_s, f"the rollout took {took_s:.1f} s")
+    return [row]
 
 
 def idle_connections(site: Site) -> list[Row]:
@@ -388,7 +375,6 @@ FAULTS: tuple[Callable[[Site], list[Row]], ...] = (
     healed_gateway("SIGSTOP of the gateway", signal.SIGSTOP, noticed_s=SILENT_S),
     stand_still,
     kill_serve,
-    full_disk,
     dead_load,
     killed_in_rollout(TRITON),
     killed_in_rollout(MODEL),

@@ -2,7 +2,7 @@
 """``make mutate``: test whether the tests catch small faults in the code that computes scores. Uses cosmic-ray.
 
 Tries the same random share of each part's mutants, in a clone of the last commit. Ends with status 1 if the tests
-catch fewer than 95 %. mutants_that_survive.yaml explains known survivors.
+catch fewer than 95 %: some mutants are equivalent.
 """
 
 from __future__ import annotations

@@ -263,10 +263,6 @@ def test_an_api_key_is_read_once_so_that_a_pipe_will_do(tmp_path: Path) -> None:
     assert result.exit_code == ExitCode.UNAVAILABLE, result.stderr
 
 
-def test_a_bad_variable_hurts_no_command_that_does_not_need_it() -> None:
-    assert invoke("score", "--help", env=VARIABLE).exit_code == ExitCode.OK
-
-
 def test_a_missing_package_costs_a_line(engines: EngineServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "prometheus_client.parser", None)
     result = invoke("status", "--url", engines.url)

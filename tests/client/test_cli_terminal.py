@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-import base64
 import importlib.metadata
 import json
 import os
-import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -19,19 +17,16 @@ import pytest
 import clip
 from client_commands import MODEL, RFM_CLIENT, TASK, ask, assert_scores, invoke
 from engine_server import EngineServer
-from paths import ROOT
-from rfm_client import FrameScores, PreferenceSample, ProgressResult, ProgressSample, Sample
+from rfm_client import FrameScores, ProgressResult
 from rfm_client.cli.documents import frame_document
 from rfm_client.cli.options import SyntheticSamples
 from rfm_client.cli.scoring import unique_stems
 from rfm_client.cli.show import status_tables
 from rfm_client.command_line import ExitCode, number
 from rfm_client.contract.description import TOY
-from rfm_client.contract.wire import encode_samples
 from rfm_client.serving import ServerStatus
 from rfm_client.transport.status import ModelStatus
 from servers import Endpoints
-from trajectories import random_trajectory
 
 WIDTH = 80  # of a terminal
 NAMES = ("episode_a.mp4", "episode_b.mp4")
@@ -128,25 +123,6 @@ def test_sample_scores_synthetic_samples(engines: EngineServer, kind: Any, use_f
             assert answer[kind] == pytest.approx(getattr(scores, kind), abs=1e-4)
             for name in ("first", "second") if kind == "preference" else ("reference", "other"):
                 assert_scores(answer[name], getattr(scores, name))
-
-
-def test_the_input_for_perf_analyzer_has_the_tensors_of_each_sample(tmp_path: Path) -> None:
-    samples: list[Sample] = [
-        ProgressSample(random_trajectory(0, 3)),
-        PreferenceSample(random_trajectory(1, 2), random_trajectory(2, 4)),
-    ]
-    write = runpy.run_path(str(ROOT / "benchmarks" / "perf_input.py"))["write"]
-    write(tmp_path / "input.json", samples)
-    for request, sample in zip(json.loads((tmp_path / "input.json").read_text())["data"], samples, strict=True):
-        tensors = encode_samples([sample])
-        assert request.keys() == tensors.keys()
-        for tensor, array in tensors.items():  # as perf_analyzer reads them, with the batch axis that it adds
-            content = request[tensor]["content"]
-            if isinstance(content, list):
-                flat = np.array([text.encode() for text in content], np.object_)
-            else:
-                flat = np.frombuffer(base64.b64decode(content["b64"], validate=True), array.dtype.newbyteorder("<"))
-            np.testing.assert_array_equal(flat.reshape(1, *request[tensor]["shape"]), array)
 
 
 def test_sample_shows_a_table_and_an_error_line_per_failed_sample(engines: EngineServer) -> None:

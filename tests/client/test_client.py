@@ -14,7 +14,7 @@ import pytest
 
 from engine_server import EngineServer
 from engines import load_engine
-from mixtures import FRAMES_MODEL, assert_same, mixed_samples
+from mixtures import FRAMES_MODEL, assert_same
 from rfm_client import (
     FRAME_SCORES,
     AccessDeniedError,
@@ -62,24 +62,6 @@ def test_samples_of_a_model_that_is_not_served_fail_and_the_others_are_scored(en
     with engines.client() as client:  # MODEL has no encoders
         outcomes = client.evaluate([video, ProgressSample(random_trajectory(0, 2)), video], return_errors=True)
     assert [type(outcome) for outcome in outcomes] == [ModelNotFoundError, ProgressResult, ModelNotFoundError]
-
-
-def test_requests_in_flight_are_bounded() -> None:
-    class Counting(Shelf):
-        now = most = 0
-
-        async def infer(self, *asked: Any, **more: Any) -> Answer:
-            self.now += 1
-            self.most = max(self.most, self.now)
-            await asyncio.sleep(0.001)
-            self.now -= 1
-            return await super().infer(*asked, **more)
-
-    shelf = Counting()
-    with RewardClient("", transports=[shelf], max_in_flight=3) as client:
-        for future in [client.submit(sample) for sample in mixed_samples(30)]:
-            future.result()
-    assert shelf.most == 3
 
 
 def test_a_long_trajectory_is_subsampled_when_asked(engines: EngineServer) -> None:
@@ -198,8 +180,6 @@ def test_embeddings_are_scored_without_a_description_which_is_asked_for_once() -
         for _ in range(3):
             client.progress(random_trajectory(0, 2))
         assert (shelf.num_asked, shelf.count) == (1, 3)
-        with pytest.raises(AccessDeniedError):  # which scores there are is not known
-            client.progress(random_trajectory(0, 2), all_scores=True)
 
 
 class Hanging(Described):
@@ -223,9 +203,8 @@ def test_a_call_that_waits_in_vain_for_its_turn_names_its_request(by_digest: boo
         open_call.cancel()
 
 
-def test_a_step_has_each_score_that_the_checkpoint_gives_unasked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(FRAME_SCORES, "log_prob", replace(FRAME_SCORES["log_prob"], asked="if given"))  # type: ignore[arg-type]
-    names = [name for name, score in FRAME_SCORES.items() if score.asked == "if given"]
+def test_a_step_has_each_score_that_the_checkpoint_gives_unasked() -> None:
+    names = [name for name, score in FRAME_SCORES.items() if not (score.is_always_asked or score.is_per_bin)]
     shelf = Described(has_encoder=False)
     shelf.more = {"more_scores": tuple(names)}
     (frame,) = filmed(1).positions

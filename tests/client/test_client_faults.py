@@ -199,40 +199,6 @@ class RestartedServer:
         self.mapped.discard(name)
 
 
-def test_a_late_word_of_a_restart_keeps_the_memory_mapped_since() -> None:
-    server, memory = RestartedServer(), SharedMemory("grpc://127.0.0.1:1")
-
-    async def call() -> str:
-        async with memory.lend(server, LARGE) as region:
-            assert region is not None
-            await asyncio.sleep(0)
-            if region.name not in server.mapped:
-                raise InferenceServerException(f"{LOST_REGION}: '{region.name}'")
-            return region.name
-
-    async def late(known: asyncio.Event) -> None:
-        async with memory.lend(server, LARGE):
-            await known.wait()
-            raise InferenceServerException(LOST_REGION)
-
-    async def ask() -> None:
-        known = asyncio.Event()
-        waiting = asyncio.create_task(late(known))
-        await call()
-        server.mapped.clear()  # a restart
-        with pytest.raises(InferenceServerException, match=LOST_REGION):
-            await call()
-        name = await call()
-        known.set()
-        with pytest.raises(InferenceServerException, match=LOST_REGION):
-            await waiting
-        assert await call() == name
-        await memory.close(server)
-        assert not server.mapped
-
-    asyncio.run(ask())
-
-
 @pytest.mark.usefixtures("nothing_shared_is_left")
 def test_a_restarted_server_gets_the_inputs_in_the_same_call(
     demo_server: Endpoints, monkeypatch: pytest.MonkeyPatch
@@ -356,16 +322,6 @@ def test_a_server_with_another_dev_shm_gets_the_inputs_through_the_socket(
         assert not [*Path(folder).iterdir()]
     (told,) = (record.message for record in caplog.records if record.name == "rfm_client")
     assert "no shared memory, inputs go through the socket: Unable to open shared memory region" in told
-
-
-def test_a_server_that_refuses_shared_memory_is_warned_of_once(
-    engines: EngineServer, caplog: pytest.LogCaptureFixture
-) -> None:
-    with RewardClient(engines.url, shared_memory=True) as client:
-        for _ in range(2):
-            client.progress(heavy(), frame_steps=2)
-    (told,) = (record.message for record in caplog.records if record.name == "rfm_client")
-    assert "no shared memory, inputs go through the socket: " in told
 
 
 ASKING = """

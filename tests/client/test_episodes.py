@@ -270,16 +270,6 @@ def test_a_frame_that_is_wrong_leaves_the_episode_as_it_was(client: RewardClient
     assert_same(of_steps([first, *map(episode.add, frames[1:])]), offline(client, frames))
 
 
-def test_a_frame_that_is_wrong_among_several_leaves_all_episodes_as_they_were(client: RewardClient) -> None:
-    frames = video(109, 3)
-    episodes = [client.episode(TASK, env=env, frames=4) for env in range(3)]
-    added(client, episodes, frames)
-    with pytest.raises(InvalidSampleError, match=r"^envs\[1\]\.frame: expected uint8 \[40, 56, 3\], as the episode's"):
-        episodes[1].keep(video(0, 1, (8, 8))[0])
-    assert [episode.step for episode in episodes] == [0, 0, 0]
-    assert [score.step for score in added(client, episodes, frames)] == [1, 1, 1]
-
-
 def test_an_episode_keeps_its_client(engines: EngineServer) -> None:
     episode = RewardClient(engines.url, model=MODEL).episode(TASK, frames=4)
     gc.collect()

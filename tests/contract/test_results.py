@@ -61,7 +61,7 @@ def test_frames_that_are_taken_keep_their_indices() -> None:
     assert every_score(0, 3).scored_frames.tolist() == [0, 1, 2]
 
 
-@pytest.mark.parametrize("name", [name for name, score in FRAME_SCORES.items() if score.asked != "always"])
+@pytest.mark.parametrize("name", [name for name, score in FRAME_SCORES.items() if not score.is_always_asked])
 def test_parts_of_which_some_lack_a_score_are_not_joined(name: str) -> None:
     parts = [every_score(seed, 2) for seed in range(3)]
     parts[1] = replace(parts[1], **{name: None})  # type: ignore[arg-type]

@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 import goldens
@@ -28,7 +29,7 @@ from rfm_client.contract import wire
 from rfm_client.contract.results import BatchTiming
 from rfm_client.contract.samples import EncoderSample
 
-OF_SOME = [name for name, score in FRAME_SCORES.items() if score.asked != "always" and not score.is_per_bin]
+OF_SOME = [name for name, score in FRAME_SCORES.items() if not (score.is_always_asked or score.is_per_bin)]
 OUTPUTS = [spec.name for spec in wire.score_outputs(NUM_BINS, OF_SOME)]
 TIMING = BatchTiming(1.5, 2.5)
 
@@ -228,9 +229,27 @@ def request(lengths: tuple[int, int], kind: int, steps: int = 0, stray: int = 0)
     }
 
 
+PICTURES = np.ones((1, 5, 8, 6, 3), np.uint8)
+
+
+def of_pictures(**changes: npt.NDArray[Any]) -> wire.Tensors:
+    """Return a request about a pair of three and two frames in an array each."""
+    question = request((3, 2), 1) | {"frames": PICTURES[:, :3], "second_frames": PICTURES[:, :2]}
+    task = np.array([[b"lift"]], np.object_)
+    return {name: question[name] for name in question if "embedding" not in name} | {"task": task} | changes
+
+
 @pytest.mark.parametrize(
     ("tensors", "message"),
     [
+        (of_pictures(task=np.array([[b"\xff\xfe"]], np.object_)), "task: expected UTF-8 text, got other bytes"),
+        (of_pictures(frames=PICTURES[:, :3, :0]), "frames: expected at least one frame of at least one pixel, got .*"),
+        (
+            of_pictures(second_frames=PICTURES[:, :1]),
+            "num_frames: expected at most the 1 frames in second_frames, got 2",
+        ),
+        (of_pictures(second_frames=PICTURES), "second_frames: expected zeros behind the 2 frames that .*"),
+        (of_pictures(frames=PICTURES), "frames: expected zeros behind the 3 frames that .*"),
         (request((0, 0), 0), r"num_frames: expected \[at least 1, 0\] for progress, got \[0, 0\]"),
         (request((1, 1), 0), r"num_frames: expected \[at least 1, 0\] for progress, got \[1, 1\]"),
         (request((2, 0), 1), r"num_frames: expected at least one frame of each of the two trajectories, got \[2, 0\]"),
@@ -273,7 +292,6 @@ def test_arrays_whose_length_varies_are_ragged_and_second_frames_optional() -> N
 
 def test_a_request_asks_for_every_given_score_except_those_on_request() -> None:
     sample = ProgressSample(embedded(0, 2))
-    always, given = {"progress", "success"}, {"unclear", "remaining_s", "relative_s", "entropy", "hop"}
+    always, given = {"progress", "success"}, {"log_prob", "unclear", "remaining_s", "relative_s", "entropy", "hop"}
     assert {*wire.outputs_for([sample])} == always
     assert {*wire.outputs_for([sample], FRAME_SCORES)} == always | given
-    assert {*wire.outputs_for([sample], FRAME_SCORES, all_scores=True)} == always | given | {"log_prob"}

@@ -73,6 +73,7 @@ NO_HEAD = "sample_type: expected {} (this checkpoint has no {} head), got {}"
 SPECIAL = "task: expected text without the model's special tokens, got '{}'"
 WRONG: dict[str, tuple[str, Sample, str]] = {
     "more frames than progress tokens": (REWIND, ProgressSample(embedded(9)), TOO_LONG),
+    "dense mode of more frames": (REWIND, ProgressSample(embedded(8), 9), "frame_steps: expected at most 8 (max_len of this checkpoint, which has"),
     "more frames in the second trajectory": (REWIND, PreferenceSample(embedded(1), embedded(9)), TOO_LONG),
     "frames of another width": (REWIND, ProgressSample(embedded(2, (13, 6))), "video_embeddings: expected float32 [T, 12], got [2, 13]"),
     "a task of another width": (REWIND, ProgressSample(embedded(2, (12, 7))), "text_embedding: expected float32 [6], got [7]"),

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
 
 from gateway_requests import (
     BLACK,
@@ -35,7 +34,7 @@ from gateway_requests import (
     preference,
     progress,
 )
-from gateways import StandIn, TestClient, inside, listening
+from gateways import StandIn, TestClient, inside
 
 NPY = "/evaluate_batch_npy"
 SAMPLE = dumped(progress(FIRST))
@@ -313,29 +312,6 @@ def test_frames_that_show_nothing_are_scored_with_a_warning_or_refused() -> None
         for index, (name, fault) in faults.items()
     ]
     check_refused(response, *refused)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.parametrize("path", ["/evaluate_batch", NPY])
-def test_no_request_that_the_schemas_allow_breaks_the_gateway(path: str) -> None:
-    import schemathesis  # here, since it takes a second to import
-
-    triton = StandIn()
-    triton.is_open.set()
-    with listening(triton) as gateway:
-        ((_, operation),) = schemathesis.openapi.from_url(f"{gateway.url}/openapi.json")[path].items()
-
-        @settings(
-            max_examples=25, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck), database=None
-        )
-        @given(case=operation.as_strategy())
-        def check(case: schemathesis.Case) -> None:
-            response = case.call()
-            assert response.status_code < 500, response.text
-            response.json()
-
-        check()
 
 
 NO_TOKEN = r"expected text without the model's special tokens, got '<\|prog_token\|>'"

@@ -4,13 +4,10 @@
 from __future__ import annotations
 
 import json
-import shutil
 import time
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 import requests
 import torch
@@ -26,16 +23,15 @@ from gateway_requests import (
     answered,
     ask_json,
     ask_npy,
-    expected,
     failure,
     filmed,
     paused,
     preference,
     progress,
 )
-from gateways import Gateway, answers, free_port, inside
+from gateways import Gateway, free_port, inside
 from rfm_client.serving import ServerStatus
-from servers import Serving, serving, wait_for
+from servers import wait_for
 
 pytestmark = pytest.mark.triton
 
@@ -143,45 +139,3 @@ def test_metrics_count_requests_and_samples(tiny: Gateway) -> None:
     requests.get(f"{tiny.url}/nowhere")
     assert [after - b for after, b in zip(counts(), before, strict=True)] == [1, 1, 1, 2, 1, 1]
     assert tiny.metric("requests_in_flight") == 0
-
-
-def own_gateway(served: Serving) -> psutil.Process:
-    children = psutil.Process(served.process.pid).children(recursive=True)
-    (found,) = (child for child in children if "rfm_gateway" in child.cmdline())
-    return found
-
-
-@pytest.mark.nightly
-def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed_or_silent(
-    triton: Triton, tmp_path: Path
-) -> None:
-    repository, port = tmp_path / "model_repository", free_port()
-    shutil.copytree(triton.repository / TINY, repository / TINY)
-    url, options = (
-        f"http://127.0.0.1:{port}",
-        ["--gateway-timeout=90", "--gateway-max-waiting=7", "--triton-silent-s=4"],
-    )
-    with serving(repository, f"--gateway-port={port}", *options) as served:
-        wait_for(lambda: served.process.poll() is not None or answers(url))
-        gateway = Gateway(url, TINY, served.endpoints.grpc_url, served.process, served.log)
-
-        def scores() -> None:
-            wait_for(lambda: answers(url))
-            assert answered(ask_json(gateway, [progress(FIRST)])) == expected(gateway, [progress(FIRST)])
-
-        scores()
-        first = own_gateway(served)
-        assert "--timeout 90.0 --max-body-mib 512" in " ".join(first.cmdline())
-        assert "--max-waiting 7" in " ".join(first.cmdline())
-        first.kill()
-        wait_for(lambda: not answers(url))
-        scores()
-        second = own_gateway(served)
-        second.suspend()
-        wait_for(lambda: not second.is_running())
-        scores()
-        started = [first, second, *psutil.Process(served.process.pid).children(recursive=True)]
-    assert served.process.returncode == 0
-    for why in ("killed by SIGKILL", "no answer for 4 s"):
-        assert f"]: gateway is started again: {why}\n" in gateway.log
-    assert not [child for child in started if child.is_running()]

@@ -28,7 +28,7 @@ from pyarrow import parquet
 import goldens
 import local_hub
 from encoding import encode, encode_here
-from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, change_column, change_info, digest_of
+from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, change_column, change_info
 from rfm_client.frames import FrameFileError, Picture
 from rfm_client.options import ConfigError
 from rfm_labels import DatasetError, LabelOptions, RayOptions, label, open_dataset
@@ -170,19 +170,6 @@ def test_pictures_are_of_8_bit_colours(save: Callable[[Any], bytes], refused: st
     for read in (picture.check, picture.pixels):
         with pytest.raises(FrameFileError, match=re.escape(message) + "$"):
             read()
-
-
-def test_exif_data_turn_images_in_tables_and_change_the_identity_of_the_episode(tmp_path: Path) -> None:
-    """LeRobot reads them the same way, through ``datasets``."""
-    root, exif = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "dataset"), Image.Exif()
-    exif[0x0112] = 6
-    save = saved(exif=exif)
-    stored = store_as_images(root, WRIST, save)
-    dataset = open_dataset(root)
-    episode = dataset.episode(0)
-    np.testing.assert_array_equal(list(dataset.frames(episode, WRIST)), np.rot90(stored, -1, axes=(1, 2)))
-    pictures = [save(Image.fromarray(frame)) for frame in stored]
-    assert dataset.identity(episode, WRIST) != digest_of(pictures)
 
 
 def store_as_images(root: Path, camera: str, save: Callable[[Any], bytes]) -> list[np.ndarray[Any, Any]]:

@@ -8,9 +8,7 @@ other recordings are made here as their tools document them.
 from __future__ import annotations
 
 import json
-import pickle
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,8 +35,6 @@ from rfm_labels import (
     read_outcomes,
 )
 from rfm_labels.datasets import episodes as forms
-from rfm_labels.plan import plan_labels
-from rfm_labels.ray_engine import EpisodeActor
 
 READERS = ROOT / "examples" / "readers"
 RECORDINGS = ROOT / "tests" / "recordings"
@@ -297,16 +293,6 @@ def test_label_and_evaluate_take_a_reader_by_its_name(folder: Path, capsys: pyte
 def test_a_reader_may_fill_the_same_array_again(folder: Path) -> None:
     dataset = open_dataset(folder, reader=named(folder, "one_buffer"))
     np.testing.assert_array_equal(list(dataset.frames(dataset.episode(1), "front")), CLIPS[1])
-
-
-def test_an_actor_of_ray_calls_the_reader_by_its_name(folder: Path, output: Path) -> None:
-    opening = pickle.loads(pickle.dumps({"reader": named(folder, "episodes")}))
-    scorer = BrightnessScorer()
-    plan = plan_labels(open_dataset(folder, **opening), scorer, LabelOptions(output=output))
-    connect = lambda: nullcontext(scorer)  # noqa: E731
-    actor = EpisodeActor(str(folder), opening, connect, plan, str(output / "parts"), workers=1)
-    assert actor({"places": [[1]]}) == {"place": [1], "reason": [""]}
-    assert scorer.num_samples == len(CLIPS[1])
 
 
 REFUSED: dict[str, str] = {

@@ -219,15 +219,6 @@ def test_a_bonus_needs_a_checkpoint_that_predicts_success(judge: Recorder, kind:
 
 
 @at_each_door
-def test_late_scores_add_up_at_the_end(judge: Recorder, kind: type[Door]) -> None:
-    with opened(kind, judge, [CodedEnv(TERMINATES, (LAST,))], options(mode="delta", blocking=False)) as door:
-        episodes = [episode for episode in played(door, 3 * LAST)[0] if episode.terminated]
-    for episode in episodes:
-        assert sum(episode.rewards) == pytest.approx(PROGRESS[LAST] - PROGRESS[0], abs=1e-6)
-        assert [episode.infos[at]["reward_model"]["lag"] for at in (0, -1)] == [0, 0]
-
-
-@at_each_door
 def test_after_an_error_delta_pays_the_missed_progress(judge: Recorder, kind: type[Door]) -> None:
     with opened(kind, judge, [CodedEnv(TERMINATES, (LAST,))], options(mode="delta")) as door:
         door.reset()
@@ -568,10 +559,6 @@ REFUSED_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
     "two rules": (
         {"success": SuccessRule(0.9), "success_bonus": 1.0, "terminate_on_success": SuccessRule(0.8)},
         "^success: expected None or the rule of terminate_on_success, ",
-    ),
-    "an end that is not awaited": (
-        {"mode": "final", "blocking": False, "await_last": False},
-        "^await_last: expected True with mode 'final'",
     ),
     "fuse": ({"fuse": "sum"}, "^fuse: expected one of mean, min, max, got 'sum'$"),
     "orient": ({"orient": "upside-down"}, "^orient: expected one of none, rotate180, .*, got 'upside-down'$"),

@@ -71,18 +71,6 @@ def test_the_loop_of_the_guide_logs_the_scores_for_rerun(
         assert_close(values, progress(client, VIDEO, [step + 1 for step in steps], None))
 
 
-def test_several_cameras_are_scored_apart_and_fused(client: RewardClient) -> None:
-    cameras = {"front": lambda frame: frame, "wrist": lambda frame: 255 - frame[::2, ::2]}
-    rewarded = RewardOptions(
-        frames_from=lambda seen: {name: shown(seen["pixels"]) for name, shown in cameras.items()},
-        cameras=["wrist", "front"],
-        fuse="min",
-    )
-    rewards, _ = play(RewardModelWrapper(CodedEnv(0, (LENGTH,)), client, TASK, rewarded))
-    apart = [progress(client, [shown(frame) for frame in VIDEO], range(1, LENGTH + 1)) for shown in cameras.values()]
-    assert_close(rewards, np.min(apart, axis=0))
-
-
 # Steps that do not wait: the test lets answers come when it wants.
 
 
@@ -131,20 +119,16 @@ def test_with_too_many_questions_open_a_step_is_skipped_and_counted_until_a_rese
     env.close()
 
 
-@pytest.mark.parametrize("await_last", [True, False])
-def test_the_last_step_waits_so_that_late_rewards_add_up_unless_it_shall_not(
-    client: RewardClient, late: LateClient, await_last: bool
-) -> None:
-    env = not_blocking(late, mode="delta", max_pending=2, await_last=await_last)
+def test_the_last_step_waits_so_that_late_rewards_add_up(client: RewardClient, late: LateClient) -> None:
+    env = not_blocking(late, mode="delta", max_pending=2)
     late.hold(1, 2, 3)
     env.step(0)
     late.let_come(1)
     rewards, infos = play_on(env)
-    known = LENGTH if await_last else 1
-    first, second, newest = progress(client, VIDEO, [0, 1, known], None)
+    first, second, newest = progress(client, VIDEO, [0, 1, LENGTH], None)
     assert_close(rewards, [second - first, *[0] * (LENGTH - 3), newest - second])
     told = infos[-1]["reward_model"]
-    assert (told["step"], told["lag"], told["skipped"]) == (known, LENGTH - known, LENGTH - 4)
+    assert (told["step"], told["lag"], told["skipped"]) == (LENGTH, 0, LENGTH - 4)
     assert {step: answer.cancelled() for step, answer in late.answers.items()} == {1: False, 2: True, 3: True}
 
 

@@ -209,13 +209,13 @@ class Serving:
 
 
 @contextmanager
-def serving(repository: Path, *more: str, to: Path | None = None) -> Iterator[Serving]:
-    """Run ``rfm serve``, which may leave nothing behind. to: file or device for the log; None: a new file"""
+def serving(repository: Path, *more: str) -> Iterator[Serving]:
+    """Run ``rfm serve``, which may leave nothing behind."""
     endpoints, status_port = Endpoints.free(), Endpoints.free().http_port
     ports = {"http": endpoints.http_port, "grpc": endpoints.grpc_port, "metrics": endpoints.metrics_port}
     options = [f"--{name}-port={port}" for name, port in (ports | {"status": status_port}).items()]
     log = repository.parent / "rfm.log"
-    with (to or log).open("wb") as lines:
+    with log.open("wb") as lines:
         process = subprocess.Popen(
             [RFM, "serve", "--repository", repository, *options, *more], stdout=lines, stderr=lines
         )

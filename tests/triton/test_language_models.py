@@ -122,8 +122,7 @@ def test_a_server_answers_as_the_engine_does(asked: Served, name: str) -> None:
     checkpoint, settings = MODELS[name]
     samples, engine = samples_of(name), Engine.of(published.load(checkpoint, **settings))
     with asked.client(name) as client:
-        asked_for = {"all_scores": True, "logits": name == "robo"}
-        together, alone = client.evaluate(samples, **asked_for), client.evaluate(samples[:1], **asked_for)
+        together, alone = (client.evaluate(each, logits=name == "robo") for each in (samples, samples[:1]))
     expected = engine.evaluate(samples)
     for outcome, wanted in zip((*together, *alone), (*expected, expected[0]), strict=True):
         assert_equal_scores(outcome, wanted)
@@ -139,7 +138,7 @@ def test_triton_answers_the_same(asked: Served, tmp_path: Path) -> None:
         for url in (server.endpoints.grpc_url, server.endpoints.http_url):
             for name in MODELS:
                 with asked.client(name) as here, RewardClient(url, model=name) as client:
-                    expected, got = (each.evaluate(samples_of(name), all_scores=True) for each in (here, client))
+                    expected, got = (each.evaluate(samples_of(name)) for each in (here, client))
                     assert client.model_info(frames=True) == here.model_info(frames=True)
                 for left, right in zip(expected, got, strict=True):
                     assert_equal_scores(right, left)
@@ -159,9 +158,7 @@ def body(samples: list[ProgressSample], **more: bool) -> dict[str, Any]:
     return {"samples": [{"sample_type": "progress", "trajectory": each} for each in told], **more}
 
 
-def test_a_score_not_asked_for_is_none_and_deltas_over_unanswered_frames_are_an_error(asked: Served) -> None:
-    with asked.client("top") as client:
-        assert client.progress(samples_of("top")[0].trajectory).log_prob is None
+def test_deltas_over_unanswered_frames_are_an_error(asked: Served) -> None:
     with asked.client("forward") as client:
         skipping = client.progress(samples_of("forward")[0].trajectory)
     assert skipping.is_answered.tolist() == [False, *[True] * (len(skipping.progress) - 1)]

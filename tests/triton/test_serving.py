@@ -7,32 +7,22 @@ import os
 import stat
 from concurrent.futures import ThreadPoolExecutor
 
-import grpc
-import numpy as np
 import pytest
-import tritonclient.grpc
-from tritonclient.grpc import service_pb2, service_pb2_grpc
-from tritonclient.utils import np_to_triton_dtype
 
 import goldens
-import rfm_export
 from commands import own_regions
-from engines import load_engine, serve_config
-from mixtures import FRAMES_MODEL, MODEL, assert_same, counts, infer, mixed_samples, plug, wait_until_at_work
-from repositories import forget_input
+from engines import load_engine
+from mixtures import FRAMES_MODEL, MODEL, assert_same, counts, mixed_samples, plug, wait_until_at_work
 from rfm_client import (
     InvalidSampleError,
     PreferenceSample,
     ProgressSample,
     RewardClient,
-    RewardError,
     Sample,
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.contract.wire import Tensors, encode_samples
 from servers import Served, model_processes
-from tolerances import TOLERANCE
 from trajectories import random_trajectory
 from vlm import video
 
@@ -119,75 +109,6 @@ def test_callers_share_batches_and_a_bad_sample_fails_alone(served: Served, prot
         assert_same(outcome, wanted)
 
 
-def embedded() -> Tensors:
-    pair = PreferenceSample(random_trajectory(1, 3), random_trajectory(2, 2))
-    return {name: array.copy() for name, array in encode_samples([pair]).items()}
-
-
-WITH_NAN = embedded()["video_embeddings"]
-WITH_NAN[0, 1, 7] = np.nan
-FRAMES = np.ones((1, 5, 8, 6, 3), np.uint8)
-QUESTION: Tensors = {
-    "sample_type": np.array([[1]], np.uint8),
-    "num_frames": np.array([[3, 2]], np.int32),
-    "frame_steps": np.array([[0]], np.int32),
-    "frames": FRAMES,
-    "task": np.array([[b"lift"]], np.object_),
-}
-
-
-def second(count: int) -> Tensors:
-    """Return the second trajectory's frames in a separate array."""
-    return {"frames": FRAMES[:, :3], "second_frames": FRAMES[:, :count]}
-
-
-BAD_EMBEDDINGS: dict[str, tuple[Tensors, str]] = {
-    "NaN": ({"video_embeddings": WITH_NAN}, r"^video_embeddings: expected finite values, got nan at \[1, 7\]$"),
-    "dense mode beyond max_len": (
-        encode_samples([ProgressSample(random_trajectory(1, 5), 17)]),
-        r"^frame_steps: expected at most 16 \(max_len of this checkpoint.*\), got 17$",
-    ),
-}
-
-BAD_FRAMES: dict[str, tuple[Tensors, str]] = {
-    "bytes that are no text": ({"task": np.array([[b"\xff\xfe"]], np.object_)}, "^task: expected UTF-8 text, got"),
-    "no pixels": ({"frames": FRAMES[:, :, :0]}, "^frames: expected at least one frame of at least one pixel"),
-    "more second frames told than sent": (second(1), "^num_frames: expected at most the 1 frames in second_frames"),
-    "fewer second frames told than sent": (second(5), "^second_frames: expected zeros behind the 2"),
-    "first frames behind those told": ({**second(2), "frames": FRAMES}, "^frames: expected zeros behind the 3"),
-}
-
-
-@pytest.mark.parametrize("name", [*BAD_EMBEDDINGS, *BAD_FRAMES])
-def test_invalid_inputs_are_refused_with_the_expected_values(served: Served, name: str) -> None:
-    is_video = name in BAD_FRAMES
-    changes, message = BAD_FRAMES[name] if is_video else BAD_EMBEDDINGS[name]
-    model, question = (f"{FRAMES_MODEL}_frames", QUESTION) if is_video else (MODEL, embedded())
-    with pytest.raises(InvalidSampleError, match=message):
-        infer(served.url("grpc"), model, question | changes, ["progress"])
-
-
-@pytest.mark.parametrize(
-    "model", [MODEL, f"{FRAMES_MODEL}_encoder", pytest.param(f"{VLM}_frames", marks=pytest.mark.slow)]
-)
-def test_a_batch_of_no_samples_is_refused(served: Served, model: str) -> None:
-    """Triton lets the request pass if the bytes fit a single sample, which an ensemble then scores."""
-    served.has(VLM if model.startswith(VLM) else model)
-    question = embedded() if model == MODEL else {**QUESTION, "task": np.array([[4, 0, 0, 0, *b"lift"]], np.uint8)}
-    if model.endswith("_encoder"):
-        question = {name: question[name] for name in ("num_frames", "frames", "task")}
-    request = service_pb2.ModelInferRequest(model_name=model)
-    for name, array in question.items():
-        is_text, axes = name == "task", [1] if name == "task" else array.shape[1:]
-        datatype = "BYTES" if is_text else np_to_triton_dtype(array.dtype)
-        request.inputs.add(name=name, datatype=datatype, shape=[0, *axes])
-        request.raw_input_contents.append(array.tobytes())
-    address = served.url("grpc").removeprefix("grpc://")
-    with grpc.insecure_channel(address) as channel, pytest.raises(grpc.RpcError) as refused:
-        service_pb2_grpc.GRPCInferenceServiceStub(channel).ModelInfer(request)
-    assert refused.value.code() == grpc.StatusCode.INVALID_ARGUMENT, refused.value
-
-
 def test_a_rewound_trajectory_is_scored(served: Served) -> None:
     """The array has negative strides."""
     forwards = random_trajectory(1, 6)
@@ -195,15 +116,6 @@ def test_a_rewound_trajectory_is_scored(served: Served) -> None:
     copied = Trajectory(video_embeddings=forwards.positions[::-1].copy(), text_embedding=forwards.text_embedding)
     with served.client("http") as client:
         assert_same(client.progress(backwards), client.progress(copied))
-
-
-def test_a_pair_of_two_frame_sizes_may_be_sent_through_shared_memory(served: Served, protocol: str) -> None:
-    pair = PreferenceSample(video(0, 4, 200, 300), video(1, 3, 120, 90))
-    with RewardClient(served.url(protocol), model=FRAMES_MODEL, shared_memory=True) as client:
-        (result,) = client.evaluate([pair])
-        with tritonclient.grpc.InferenceServerClient(served.url("grpc").removeprefix("grpc://")) as triton:
-            assert triton.get_system_shared_memory_status().regions
-    assert_same(result, load_engine(FRAMES_MODEL).evaluate([pair])[0])
 
 
 def test_a_load_of_an_unchanged_model_keeps_its_process(served: Served) -> None:
@@ -218,42 +130,3 @@ def test_no_other_user_can_read_the_shared_memory_of_a_server() -> None:
     found = [path.stat() for path in own_regions(os.getpid())]
     assert any(stat.S_ISREG(each.st_mode) and each.st_size >= LEAST_REGION_BYTES for each in found)
     assert {stat.S_IMODE(each.st_mode) & 0o077 for each in found} == {0}
-
-
-@pytest.mark.parametrize("model", [FRAMES_MODEL, pytest.param(VLM, marks=pytest.mark.slow)])
-def test_a_second_array_may_hold_frames_of_one_size(served: Served, model: str) -> None:
-    """Tensors may use the optional input for any pair, and for a sample without a second trajectory."""
-    first, second = (video(seed, 2, 56, 56) for seed in (1, 2))
-    tensors = encode_samples([PreferenceSample(first, second), ProgressSample(first)])
-    apart = {
-        "frames": np.stack([first.positions, first.positions]),
-        "second_frames": np.stack([second.positions, np.zeros_like(second.positions)]),
-    }
-    outputs = ["progress", "success", "preference"]
-    served.has(model)
-    url = served.url("http")
-    expected, got = (infer(url, f"{model}_frames", t, outputs) for t in (tensors, tensors | apart))
-    for name in outputs:
-        assert np.isfinite(got[name][0]).all()
-        np.testing.assert_allclose(got[name], expected[name], rtol=0, atol=TOLERANCE)
-
-
-@pytest.mark.nightly
-def test_a_model_from_before_pairs_of_two_frame_sizes_says_so(served: Served) -> None:
-    config = goldens.config(VLM)
-    rfm_export.export(config.checkpoint, served.repository, serve_config(config, "before"))
-    forget_input(served.repository, "before_frames", "second_frames")
-    wide, tall = video(0, 2, 56, 84), video(1, 2, 84, 56)
-    pairs = [PreferenceSample(wide, wide), PreferenceSample(wide, tall), PreferenceSample(tall, tall)]
-    with served.api() as api:
-        api.load("before_frames")
-        with served.client("grpc", "before") as client:
-            one_size, two_sizes, another_size = client.evaluate(pairs, return_errors=True)
-        api.unload("before_frames")
-    assert isinstance(two_sizes, InvalidSampleError)
-    assert two_sizes.message == (
-        "second_frames: expected a model that takes pairs of two frame sizes, "
-        "got one that was exported before there was this input; export it again, or resize a trajectory"
-    )
-    assert not isinstance(one_size, RewardError)
-    assert not isinstance(another_size, RewardError)

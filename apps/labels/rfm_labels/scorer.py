@@ -122,11 +122,11 @@ class ClientScorer:
 
     def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
         """Return one result per sample. Raises RewardError for the first failure."""
-        return cast("list[ProgressResult]", self._client.evaluate(samples, all_scores=True))
+        return cast("list[ProgressResult]", self._client.evaluate(samples))
 
     def curve(self, trajectory: Trajectory, sampling: Sampling, go_on: Callable[[], None]) -> ProgressResult:
         """Return each frame's scores, as if it were the newest. Raises RewardError."""
-        return self._client.curve(trajectory, sampling, go_on=go_on, all_scores=True)
+        return self._client.curve(trajectory, sampling, go_on=go_on)
 
 
 def _digests(infos: Sequence[ModelInfo]) -> tuple[str, str | None, str | None]:

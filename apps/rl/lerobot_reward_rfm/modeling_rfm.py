@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, islice
 from typing import Any, cast
 
 import numpy as np
@@ -27,8 +26,6 @@ from rfm_client import (
 )
 from rfm_client.frames import Sampling
 from rfm_client.options import require
-
-AT_A_TIME = 32  # samples: each copies its frames, so all prefixes of an episode at once would fill memory
 
 
 @dataclass(frozen=True)
@@ -107,7 +104,7 @@ class RfmRewardModel(PreTrainedRewardModel):
     def predict_progress(self, batch: Mapping[str, Any]) -> RfmPrediction:
         """Return scores for all frames. No score uses later frames, so the last equals ``compute_reward``'s.
 
-        The server scores B times T samples. Raises RewardError.
+        Raises RewardError.
         """
         trajectories = trajectories_of(batch, self.config)
         results = scores_of_all_frames(self.client, trajectories, self.config)
@@ -154,7 +151,7 @@ def newest_scores(
         ProgressSample(replace(trajectory, frames=cast(Any, trajectory.frames)[prefix.indices]))
         for trajectory, prefix in zip(trajectories, prefixes, strict=True)
     ]
-    results = zip(evaluated(client, samples, config), prefixes, strict=True)
+    results = zip(cast(list[ProgressResult], client.evaluate(samples, resize=config.resize)), prefixes, strict=True)
     newest = [result.at(slice(prefix.read, prefix.read + 1)) for result, prefix in results]
     for index, result in enumerate(newest):
         check_clear(result, 0, f"sample {index} of the batch")
@@ -166,23 +163,14 @@ def scores_of_all_frames(
 ) -> list[ProgressResult]:
     """Return scores for every frame of each trajectory, [T], as ``newest_scores`` would at that frame.
 
-    Costs one sample per frame. Raises RewardError.
+    Raises RewardError.
     """
     rule = rule_of(client.model_info(frames=True), config)
-    results = iter(evaluated(client, chain.from_iterable(map(rule.samples, trajectories)), config))
-    joined = [rule.joined(list(islice(results, trajectory.num_frames))) for trajectory in trajectories]
-    for index, result in enumerate(joined):
+    curves = [client.curve(trajectory, rule, resize=config.resize) for trajectory in trajectories]
+    for index, result in enumerate(curves):
         for frame in range(len(result.progress)):
             check_clear(result, frame, f"frame {frame} of sample {index}")
-    return joined
-
-
-def evaluated(client: RewardClient, samples: Iterable[ProgressSample], config: RfmRewardConfig) -> list[ProgressResult]:
-    """Return results in sample order, with the frames of only a few samples in memory. Raises RewardError."""
-    waiting, results = iter(samples), list[ProgressResult]()
-    while some := list(islice(waiting, AT_A_TIME)):
-        results += cast(list[ProgressResult], client.evaluate(some, resize=config.resize))
-    return results
+    return curves
 
 
 def check_clear(result: ProgressResult, slot: int, where: str) -> None:

@@ -213,14 +213,14 @@ class RewardedEnvs:
             ends = ends or episode.succeeded
             is_first = episode.known is None
             due = ends or is_first or self._options.is_due(episode.steps.step)
-            waits = self._options.blocking or is_first or (ends and self._options.await_last)
+            waits = self._options.blocking or is_first or ends
             if ends:
                 episode.cancel()
             if due and waits:
                 awaited.append(episode)
-            elif due and not ends and len(episode.pending) >= self._options.max_pending:
+            elif due and len(episode.pending) >= self._options.max_pending:
                 episode.num_skipped += 1
-            elif due and not ends:
+            elif due:
                 episode.pending.append(self._client.submit_episodes([episode.steps]))
         if awaited:
             scores = self._client.score_episodes([episode.steps for episode in awaited])

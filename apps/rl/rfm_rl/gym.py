@@ -9,7 +9,7 @@ A wrapper keeps all frames of the running episode, H * W * 3 bytes per step. The
 A wrapper scores the reset, every ``every``-th step (not in mode ``final`` without a success rule), and the last step of
 an episode. With ``blocking``, a step waits for its score. Without ``blocking``, a step uses the newest known score, and
 requests its own only if fewer than ``max_pending`` steps have open requests. The reset always waits for its score. The
-last step waits, too, and cancels older requests; without ``blocking``, ``await_last=False`` leaves it unscored.
+last step waits, too, and cancels older requests.
 
 ``info["reward_model"]`` has the same keys after a reset and after a step: the returned ``reward`` and the environment's
 own ``env_reward`` (NaN at a reset), ``progress`` and ``success`` from the newest known score (success is NaN if the

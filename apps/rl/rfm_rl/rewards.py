@@ -58,9 +58,8 @@ class RewardOptions(FrameOptions):
     sampling, fuse, orient, channels, resize: as in ``rfm_client.episodes.FrameOptions``; rendered frames are
         changed alike
     max_frames: ``frames`` in EpisodeOptions: the rule's frame count
-    blocking: True: a step waits for its score
+    blocking: True: a step waits for its score; False: only the reset and an episode's last step wait
     max_pending: how many of an environment's steps may have open requests when not blocking
-    await_last: True: wait for the score of an episode's last step even when not blocking; False: drop open requests
     """
 
     mode: Mode = "absolute"
@@ -75,7 +74,6 @@ class RewardOptions(FrameOptions):
     max_frames: int | None = None
     blocking: bool = True
     max_pending: int = 4
-    await_last: bool = True
 
     def __post_init__(self) -> None:
         require("mode", self.mode in get_args(Mode), f"one of {', '.join(get_args(Mode))}", repr(self.mode))
@@ -94,8 +92,6 @@ class RewardOptions(FrameOptions):
         require(
             "success", is_one, f"None or the rule of terminate_on_success, {self.terminate_on_success}", self.success
         )
-        has_end = self.mode != "final" or self.await_last
-        require("await_last", has_end, "True with mode 'final', which pays for the last frame", self.await_last)
         for name in ("every", "max_pending", "max_frames"):
             if getattr(self, name) is not None:
                 checked_count(name, getattr(self, name))

@@ -66,7 +66,7 @@ def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> 
     sent = [fit.sample.trajectories[0] for fit in fits]
     orders = list(itertools.permutations(range(len(sources)), 2))
     answers = client.evaluate([PreferenceSample(sent[first], sent[second]) for first, second in orders])
-    alone = client.evaluate([fit.sample for fit in fits], all_scores=True)
+    alone = client.evaluate([fit.sample for fit in fits])
     scores = [
         cast(ProgressResult, with_frame_indices(each, fit.frame_indices)) for each, fit in zip(alone, fits, strict=True)
     ]

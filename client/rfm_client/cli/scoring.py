@@ -206,7 +206,7 @@ def _evaluate(
     client: RewardClient, trajectory: Trajectory, video: VideoOptions, prefix: PrefixOptions
 ) -> ProgressResult:
     info = client.model_info(frames=trajectory.frames is not None)
-    options: CallOptions = {"all_scores": True, "resize": video.resize}
+    options: CallOptions = {"resize": video.resize}
     # When an episode is scored as a whole, all frames are shown at once.
     if prefix.sampling is None or (info.needs_whole_episode and prefix.sampling == "all"):
         options["subsample"] = video.subsample and prefix.sampling is None

@@ -38,8 +38,8 @@ class Score:
     Output tensor, JSON key and label column share the field's name. The tensor is FP32.
 
     meaning: a phrase for label files
-    asked: when a client requests it: always; whenever a model for raw frames gives it (for embeddings: with
-        ``all_scores``); or with a call option
+    is_always_asked: True: a client requests it from every model; False: whenever the model gives it, and scores per bin
+        with the option ``logits``
     may_be_unknown: NaN at all frames if the checkpoint does not predict it
     replaced_by: score that some models predict instead; this one is then NaN at all frames; empty: none
     is_per_bin: [T, K], and neither in JSON nor in labels; else [T]
@@ -52,7 +52,7 @@ class Score:
     """
 
     meaning: str
-    asked: Literal["always", "if given", "on request"] = "on request"
+    is_always_asked: bool = False
     may_be_unknown: bool = False
     replaced_by: str = ""
     is_per_bin: bool = False
@@ -85,7 +85,7 @@ class FrameScores:
         ``is_answered`` is False. Robo-Dopamine's is not clipped and may leave 0..1
     success: float32 [T], probability that the task is done; NaN throughout: the checkpoint does not predict it
     progress_logits: float32 [T, K], raw scores for the progress bins, on request, from discrete checkpoints only
-    log_prob: float32 [T], TOPReward's log-probability that the frames so far complete the task, on request
+    log_prob: float32 [T], TOPReward's log-probability that the frames so far complete the task
     unclear: bool [T], True where RoboReward's written answer states no single whole score, so progress may be misread;
         None: the model writes no answers
     remaining_s: float32 [T], RynnValue's seconds from each frame until the task is done
@@ -99,9 +99,11 @@ class FrameScores:
     """
 
     progress: Annotated[
-        Float32Array, Score("Share of the task that is done", asked="always", replaced_by="remaining_s")
+        Float32Array, Score("Share of the task that is done", is_always_asked=True, replaced_by="remaining_s")
     ]
-    success: Annotated[Float32Array, Score("Probability that the task is done", asked="always", may_be_unknown=True)]
+    success: Annotated[
+        Float32Array, Score("Probability that the task is done", is_always_asked=True, may_be_unknown=True)
+    ]
     progress_logits: Annotated[
         Float32Array | None, Score("Raw scores of the progress bins", is_per_bin=True, bounds=(None, None))
     ] = None
@@ -113,7 +115,6 @@ class FrameScores:
         npt.NDArray[np.bool_] | None,
         Score(
             "1 where the model's written answer states no single whole score",
-            asked="if given",
             mark="the model's written answer states no single whole score (as 1.5, 3/5, or two scores), so progress may"
             " be misread; --strict-answers refuses these",
             higher_is_better=False,
@@ -124,7 +125,6 @@ class FrameScores:
         Float32Array | None,
         Score(
             "Seconds that remain until the task is done",
-            asked="if given",
             bounds=(None, None),
             unit="s",
             higher_is_better=False,
@@ -132,13 +132,12 @@ class FrameScores:
     ] = None
     relative_s: Annotated[
         Float32Array | None,
-        Score("Seconds since the frame before, by the model", asked="if given", bounds=(None, None), unit="s"),
+        Score("Seconds since the frame before, by the model", bounds=(None, None), unit="s"),
     ] = None
     entropy: Annotated[
         Float32Array | None,
         Score(
             "Entropy of the remaining seconds in nats: how unsure the model is",
-            asked="if given",
             bounds=(0.0, None),
             unit="nats",
             higher_is_better=False,
@@ -148,7 +147,6 @@ class FrameScores:
         Float32Array | None,
         Score(
             "Change at each frame that the model compared with another",
-            asked="if given",
             bounds=(None, None),
             skips_frames=True,
         ),

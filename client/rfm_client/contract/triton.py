@@ -14,7 +14,7 @@ from typing import Any, TypeAlias, TypeVar
 
 from rfm_client.contract import errors
 from rfm_client.contract.addresses import grpc_proxy, with_proxy
-from rfm_client.contract.wire import GOAL, NUM_FRAMES, SECOND_FRAMES, VIEWS, frames_name
+from rfm_client.contract.wire import GOAL, NUM_FRAMES, VIEWS, frames_name
 
 BadRequest: TypeAlias = Callable[[str], errors.RewardError]
 
@@ -57,14 +57,9 @@ _WRONG_SHAPE = re.compile(  # without the batch axis, which the caller did not a
 )
 _NO_INPUT = re.compile(
     r"(?:expected (?:number of inputs between \d+ and )?\d+ (?:inputs )?but got .*|unexpected .*input )"
-    rf"'(?P<name>{'|'.join((SECOND_FRAMES, *VIEWS, GOAL))})'"
+    rf"'(?P<name>{'|'.join((*VIEWS, GOAL))})'"
 )
-_OF_PAIRS = (  # a model that has the input, one that lacks it, and the remedy
-    "a model that takes pairs of two frame sizes",
-    "one that was exported before there was this input",
-    "export it again, or resize a trajectory",
-)
-_OF_VIEWS = (
+_OF_VIEWS = (  # a model that has the input, one that lacks it, and the remedy
     "a model that reads views and a goal, such as Robo-Dopamine",
     "one that reads the frames of one camera",
     "leave out views and goal",
@@ -151,9 +146,7 @@ def error_of(status: str, message: str, bad_request: BadRequest) -> errors.Rewar
         return errors.InvalidSampleError.at(shape["name"], f"[{shape['expected']}]", f"[{shape['got']}]")
     without = _NO_INPUT.search(text)
     if without is not None:
-        return errors.InvalidSampleError.at(
-            without["name"], *(_OF_PAIRS if without["name"] == SECOND_FRAMES else _OF_VIEWS)
-        )
+        return errors.InvalidSampleError.at(without["name"], *_OF_VIEWS)
     if PROCESS_ENDED in text and "Stub process" in text:
         return errors.ProcessEndedError(text)
     if LOST_REGION in text or f"has {NO_VERSIONS}" in text:  # the sample is not at fault: a retry may succeed

@@ -108,7 +108,7 @@ class StepScorer:
         frames = [Frame(pixels) for pixels in trajectory.positions]
         self._scorer.tell_of_length(len(sampling.prefix(len(frames) - 1).indices), info)
         call, results = begin(), list[Result]()
-        outputs = (*wire.outputs_for((), info.scores, all_scores=call.all_scores), *call.outputs)
+        outputs = (*wire.outputs_for((), info.scores), *call.outputs)
         count = max(MAX_NEW_BYTES_IN_TURN // frames[0].pixels.nbytes, LEAST_IN_TURN)
         count = min(count, info.max_batch_size or count)
 

@@ -135,8 +135,9 @@ class Steps:
         self._check_predicted(fused)
         is_predicted = not np.isnan(fused.success).any()
         succeeded = is_predicted and fused.succeeded(last=rule.last, threshold=rule.threshold)
-        unasked = [name for name in fused.arrays if FRAME_SCORES[name].asked == "if given"]
-        more = {name: fused.arrays[name][-1].item() for name in unasked}
+        more = {
+            name: array[-1].item() for name, array in fused.arrays.items() if not FRAME_SCORES[name].is_always_asked
+        }
         return StepScore(float(fused.progress[-1]), float(fused.success[-1]), succeeded, step, ms, more)
 
     def _check_predicted(self, scores: FrameScores) -> None:

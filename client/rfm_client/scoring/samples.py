@@ -42,8 +42,6 @@ class CallOptions(TypedDict, total=False):
 
     timeout_s: time limit; None: the client's
     logits: True: add the raw scores for the progress bins (checkpoints with bins only)
-    log_prob: True: add a log-probability for each frame (TOPReward only)
-    all_scores: True: add every other frame score, except ``logits``
     timing: True: add the server's time for the batch
     subsample: True: score at most ``ModelInfo.max_frames`` frames, evenly spaced from first to last, as in training;
         ``frame_indices`` in the result lists them
@@ -54,8 +52,6 @@ class CallOptions(TypedDict, total=False):
 
     timeout_s: float | None
     logits: bool
-    log_prob: bool
-    all_scores: bool
     timing: bool
     subsample: bool
     resize: bool
@@ -87,9 +83,8 @@ class Call:
         prefix = request_id or secrets.token_hex(_ID_BYTES)
         self.deadline = deadline
         self.request_ids = (f"{prefix}-{number}" for number in itertools.count(1))
-        outputs = {wire.PROGRESS_LOGITS: "logits", "log_prob": "log_prob", wire.TIMING_MS: "timing"}
+        outputs = {wire.PROGRESS_LOGITS: "logits", wire.TIMING_MS: "timing"}
         self.outputs = tuple(output for output, option in outputs.items() if options.get(option))
-        self.all_scores = options.get("all_scores", False)
         self.subsample, self.resize = options.get("subsample", False), options.get("resize", False)
 
     def at(self, server: int) -> Call:
@@ -236,7 +231,7 @@ class SampleScorer:
         more: list[str] = []
         try:
             given = await self._given(model, samples, call) if asks_given else ()
-            more = [name for name in wire.outputs_for(samples, given, all_scores=call.all_scores) if name not in asked]
+            more = [name for name in wire.outputs_for(samples, given) if name not in asked]
             answer = await self.infer(model, size, tensors, (*asked, *more), call, request_id)
             return wire.decode_results(answer.tensors, samples, answer.model_version)
         except (InvalidSampleError, InferenceFailedError) as error:
@@ -253,7 +248,7 @@ class SampleScorer:
 
     async def _given(self, model: str, samples: Sequence[Sample], call: Call) -> tuple[str, ...]:
         """Return the names of all scores in the model's description. Raises RewardError."""
-        is_needed = call.all_scores or samples[0].trajectories[0].frames is not None
+        is_needed = samples[0].trajectories[0].frames is not None
         if not is_needed and model in self._undescribed:
             return ()
         try:

@@ -44,14 +44,12 @@ logger = logging.getLogger("rfm_client")
 
 
 class Region:
-    """Memory that the server also maps, after ``reserve``. Raises OSError for a name that cannot be made.
+    """Memory that the server also maps, after ``reserve``. Raises OSError for a name that cannot be made."""
 
-    generation: how many server restarts were noticed before
-    """
-
-    def __init__(self, name: str, byte_size: int, generation: int) -> None:
-        self.name, self.byte_size, self.generation = name, byte_size, generation
+    def __init__(self, name: str, byte_size: int) -> None:
+        self.name, self.byte_size = name, byte_size
         self.was_used = False  # by a request, even one that failed
+        self.is_lost = False  # the server does not know it
         (FOLDER / name).touch(0o600, exist_ok=False)
 
     def reserve(self) -> None:
@@ -83,7 +81,6 @@ class SharedMemory:
         self._names = (f"rfm-client-{uuid.uuid4().hex}-{number}" for number in itertools.count())
         self._is_usable = True
         self._has_warned = False
-        self._generation = 0
         self._free: list[Region] = []
         self._reserving = asyncio.Lock()  # or each of several would find the same room
         self._registered: set[str] = set()  # names that the server may map
@@ -100,18 +97,21 @@ class SharedMemory:
             await asyncio.shield(writing)
             yield region
         except InferenceServerException as error:
-            if triton.LOST_REGION in (error.message() or "") and region.generation == self._generation:
-                self._generation += 1  # the server was restarted, and knows no region
+            if triton.LOST_REGION in (error.message() or ""):  # the server was restarted, and knows no region
+                region.is_lost = True
                 if not region.was_used:
                     self._give_up("several servers share this address: one has mapped a region, another was asked")
+                lost, self._free = [region, *self._free], []
+                for each in lost:  # another server at this address may still map it
+                    await self._unregister(client, each.name)
             raise
         finally:
             region.was_used = True
             # After a cancelled call the server may still read the region, but its answer is dropped.
-            if writing.done():
-                self._free.append(region)
-            else:  # a thread still writes
+            if not writing.done():  # a thread still writes
                 writing.add_done_callback(lambda _: self._free.append(region))
+            elif not region.is_lost:
+                self._free.append(region)
 
     async def close(self, client: Any) -> None:
         """Make the server unmap all regions. A region that a request still uses after CLOSE_TIMEOUT_S stays mapped."""
@@ -124,10 +124,6 @@ class SharedMemory:
                         await asyncio.sleep(IN_USE_PAUSE_S)
 
     async def _take(self, client: Any, byte_size: int) -> Region | None:
-        lost = [region for region in self._free if region.generation != self._generation]
-        self._free = [region for region in self._free if region.generation == self._generation]
-        for region in lost:  # another server at this address may still map it
-            await self._unregister(client, region.name)
         fitting = [region for region in self._free if region.byte_size >= byte_size]
         if fitting:
             region = min(fitting, key=lambda region: region.byte_size)
@@ -160,7 +156,7 @@ class SharedMemory:
         return region
 
     async def _made(self, byte_size: int) -> Region:
-        region = Region(next(self._names), byte_size, self._generation)
+        region = Region(next(self._names), byte_size)
         try:
             async with self._reserving:
                 await off_loop(byte_size, region.reserve)

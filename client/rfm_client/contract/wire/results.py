@@ -26,25 +26,20 @@ from rfm_client.contract.samples import Float32Array, PreferenceSample, Progress
 from rfm_client.contract.wire.specs import PREFERENCE, SIMILARITY, TIMING_MS, Tensors, pad_stack
 
 
-def outputs_for(samples: Sequence[Sample], given: Collection[str] = (), *, all_scores: bool = False) -> tuple[str, ...]:
+def outputs_for(samples: Sequence[Sample], given: Collection[str] = ()) -> tuple[str, ...]:
     """Return the scores that these samples ask for. Others would be NaN and waste bandwidth.
 
     given: frame scores that the model gives, according to its description
-    all_scores: True: add scores that a call option requests, except those for progress bins
     """
     kinds = set(map(type, samples))
     asked_by = {PREFERENCE: PreferenceSample, SIMILARITY: SimilaritySample}
-    return (*_frame_outputs(tuple(given), all_scores), *(name for name, kind in asked_by.items() if kind in kinds))
+    return (*_frame_outputs(tuple(given)), *(name for name, kind in asked_by.items() if kind in kinds))
 
 
 @lru_cache
-def _frame_outputs(given: tuple[str, ...], all_scores: bool) -> tuple[str, ...]:
-    return tuple(
-        name
-        for name, score in FRAME_SCORES.items()
-        if score.asked == "always"
-        or (name in given and (score.asked == "if given" or (all_scores and not score.is_per_bin)))
-    )
+def _frame_outputs(given: tuple[str, ...]) -> tuple[str, ...]:
+    scores = FRAME_SCORES.items()
+    return tuple(name for name, score in scores if score.is_always_asked or (name in given and not score.is_per_bin))
 
 
 def encode_results(results: Sequence[Result], num_positions: int, outputs: Collection[str]) -> Tensors:
@@ -118,7 +113,7 @@ def _scores_between(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions
             answered_as=skipping if name in ("progress", skipping) else None,
         )
         for name, score in FRAME_SCORES.items()
-        if name in tensors or score.asked == "always"
+        if name in tensors or score.is_always_asked
     }
     return {name: part > 0 if FRAME_SCORES[name].mark else part for name, part in given.items()}
 

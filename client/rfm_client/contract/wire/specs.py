@@ -147,7 +147,7 @@ def score_outputs(progress_bins: int | None, more: Collection[str] = ()) -> tupl
     progress_bins: K of a discrete checkpoint; None: continuous
     more: frame scores beyond those that every model gives and those for progress bins
     """
-    of_every_model = [name for name, score in FRAME_SCORES.items() if score.asked == "always"]
+    of_every_model = [name for name, score in FRAME_SCORES.items() if score.is_always_asked]
     of_bins = [name for name, score in FRAME_SCORES.items() if score.is_per_bin and progress_bins is not None]
     return (
         *(TensorSpec(name, "FP32", (VARIABLE,)) for name in of_every_model),
