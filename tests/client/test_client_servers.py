@@ -46,6 +46,7 @@ class Stand:
         self.sizes: list[int] = []  # samples per answered request
         self._up_s = 0.0
         self.version = 1
+        self.weights_digest = "a" * 16
         self.asked: Counter[str] = Counter()
 
     async def infer(
@@ -75,7 +76,8 @@ class Stand:
         self.asked["model_info"] += 1
         if self.error is not None:
             raise self.error
-        return ModelInfo(name=model, versions=(str(self.version),), max_batch_size=self.max_batch_size)
+        described = {"max_batch_size": self.max_batch_size, "weights_digest": self.weights_digest}
+        return ModelInfo(name=model, versions=(str(self.version),), **described)
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
         return self.error is None and not (self.is_down or self.is_silent)
@@ -242,6 +244,17 @@ def test_a_call_waits_for_its_only_server_to_be_back() -> None:
     only.num_ends, only.down_s = 16, 0.5
     assert kinds(ask([only], 16)) == {ProgressResult}
     assert (only.asked["infer"], only.asked["while down"]) == (32, 0)
+
+
+def test_a_server_that_comes_back_with_another_checkpoint_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    stand = Stand()
+    with RewardClient("", transports=[stand]) as client:
+        assert client.model_info().weights_digest == "a" * 16
+        for digest, told in (("a" * 16, 0), ("b" * 16, 1), ("b" * 16, 1)):
+            stand.num_ends, stand.weights_digest = 1, digest
+            client.progress(SEEN)
+            assert caplog.text.count(f"another checkpoint, rfm (weights {'b' * 16}) instead of rfm") == told
+        assert client.model_info().weights_digest == "b" * 16
 
 
 @pytest.mark.parametrize("num_servers", [1, 3])

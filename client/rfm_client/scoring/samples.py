@@ -112,7 +112,8 @@ class SampleScorer:
         self._model = model
         self._servers = servers
         self._concurrency = concurrency
-        self._infos: dict[str, ModelInfo] = {}  # until another model version answers
+        self._infos: dict[str, ModelInfo] = {}  # until another model version answers, or a lost server
+        self._returns = 0  # of servers, when the descriptions were last compared
         self._undescribed: set[str] = set()  # not asked about embeddings again, which they score without a description
         self._checks_lengths = True  # until a trajectory was too long
         self._checks_blank = True  # until a video was blank
@@ -284,9 +285,25 @@ class SampleScorer:
             error.request_id = request_id
             raise
         known = self._infos.get(model)
-        if known is not None and known.versions and answer.model_version not in known.versions:
+        if known is not None and self._servers.returns != self._returns:
+            self._returns = self._servers.returns
+            await self._tell_of_change(known, model, call.deadline)
+        elif known is not None and known.versions and answer.model_version not in known.versions:
             del self._infos[model]
         return answer
+
+    async def _tell_of_change(self, before: ModelInfo, model: str, deadline: Deadline) -> None:
+        """Log that a server that was lost came back with another checkpoint, if it did."""
+        try:
+            now = await self.model_info(model, deadline, refresh=True)
+        except RewardError as error:
+            logger.warning("%s: a server is back, and whether with the same checkpoint is unknown: %s", model, error)
+            return
+        if now.weights_digest != before.weights_digest:
+            told = [f"{info.source or info.name} (weights {info.weights_digest})" for info in (now, before)]
+            logger.warning(
+                "%s: a server is back with another checkpoint, %s instead of %s: scores do not mix", model, *told
+            )
 
 
 def _longest(sample: Sample) -> int:

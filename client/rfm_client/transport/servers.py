@@ -109,6 +109,7 @@ class Servers:
         self._servers = [KnownServer(transport) for transport in transports]
         self._retry = retry
         self._is_closed = False
+        self.returns = 0  # how often a server answered that had failed before
         self._answered: set[str] = set()  # models that any server has served
         self._moments = itertools.count(1)
 
@@ -245,6 +246,7 @@ class Servers:
                 if deadline.ends_within(0):  # the pause took longer than planned
                     raise
             else:
+                self.returns += server.failures > 0
                 server.failures = 0
                 for other, refusal in refusals.items():  # not before: if all refuse, no server is at fault
                     self._leave_out(other, model, refusal)
