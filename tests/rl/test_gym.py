@@ -60,9 +60,10 @@ def test_the_loop_of_the_guide_logs_the_scores_for_rerun(
 ) -> None:
     guide = (ROOT / "docs" / "guides" / "reward_an_rl_loop.md").read_text()
     (loop,) = (code for code in re.findall(r"^```py\n(.*?)^```", guide, re.M | re.S) if "log(" in code)
-    ((before, log),) = re.findall(r"^\| Rerun .*\| `(.*)` \| `(.*)` \|$", guide, re.M)
+    ((init, save),) = re.findall(r"# Rerun .*, after (.*) and (.*)", loop)
     steps = range(LENGTH)
-    code = f"{before}\ndef log(name, value, step): {log}\n{loop.replace('range(1000)', str(steps))}rerun.disconnect()"
+    of_rerun = re.sub(r".*# (W&B|TensorBoard).*\n", "", loop).replace("range(1000)", str(steps))
+    code = f"{init}\n{save}\n{of_rerun}rerun.disconnect()"
     monkeypatch.chdir(tmp_path)
     exec(code, {"rerun": rerun, "env": RewardModelWrapper(CodedEnv(0, (LENGTH,)), client, TASK, options())})
     for key in ("progress", "reward"):
