@@ -201,9 +201,10 @@ model_repository: $(INSTALLED)
 CHECK_PYTHON = 'import sys; own = sys.version_info[:2]; sys.exit("make: expected Python 3.10, 3.11 or 3.12, got %d.%d:" % own \
   + " make $(MAKECMDGOALS) PYTHON=python3.12" if not (3, 10) <= own <= (3, 12) else 0)'
 PINS := pyproject.toml client/pyproject.toml $(wildcard apps/*/pyproject.toml) constraints.txt
-# uv reads no settings of pip: a package index and folders of wheels are handed on.
+# uv reads no settings of pip: a package index, folders of wheels and certificates are handed on.
 PIP_SETTING = $(shell $(BIN)/pip config list | sed -n "s/^[^=]*[.]$(1)='\(.*\)'$$/$(2)=\1/p" | head -n 1)
-UV_SETTINGS = $(call PIP_SETTING,index-url,UV_DEFAULT_INDEX) $(call PIP_SETTING,find-links,UV_FIND_LINKS)
+UV_SETTINGS = $(call PIP_SETTING,index-url,UV_DEFAULT_INDEX) $(call PIP_SETTING,find-links,UV_FIND_LINKS) \
+  $(call PIP_SETTING,cert,SSL_CERT_FILE)
 INSTALL = $(UV_SETTINGS) $(BIN)/uv pip install --quiet --python $(BIN)/python --constraint constraints.txt
 
 $(BIN)/uv:
