@@ -239,6 +239,12 @@ REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda folder: evaluate_labels([labels(folder / f"{n}.parquet", {n: RISING}) for n in range(2)]),
         "labels: expected an episode that all files have, got none",
     ),
+    "files that name an episode differently": (
+        lambda folder: evaluate_labels(
+            [labels(folder / f"{name}_progress.parquet", {0: RISING}, names={0: name}) for name in ("a.mp4", "_0.mp4")]
+        ),
+        r"_0\.mp4_progress\.parquet: episode 0: expected a\.mp4 as in .*a\.mp4_progress\.parquet, got _0\.mp4: label ag",
+    ),
     "one file twice": (
         lambda folder: evaluate_labels([labels(folder / "a.parquet", {0: RISING})] * 2),
         "labels: expected each file once",

@@ -204,6 +204,17 @@ def test_an_alias_is_deleted_by_its_listed_name_and_by_the_one_given_to_label(ou
     assert before.keys() - labels(output).keys() == {"sarm_progress.parquet"}
 
 
+def test_labels_are_deleted_whole_by_the_name_of_their_file_beside_a_foreign_file_named_as_parts(output: Path) -> None:
+    labelled(TOY, output, episodes=[0], name="first")
+    (output / ".first_parts").rename(output / ".moved_parts")
+    (output / ".junk_parts").write_text("no folder")
+    done = rfm_client("label", TOY, "--output", output, "--remove", "first_progress")
+    deleted = [f"{output / file}, labels" for file in ("first_progress.parquet", "reward_signals/first.parquet")]
+    assert [line.partition(" of")[0] for line in done.stdout.splitlines()] == [f"deleted {line}" for line in deleted]
+    assert f"writes them again from {output / '.moved_parts'}\n" in done.stderr
+    assert not list(output.rglob("*first*"))
+
+
 REFUSED = {  # words after --remove, and the refusal
     "no name": (["", "--yes"], "'--remove': expected 1 to 64 letters, digits, _ or -, got ''"),
     "some episodes": (["rfm", "--episodes", "0"], "--remove excludes --episodes"),

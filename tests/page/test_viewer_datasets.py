@@ -151,9 +151,10 @@ def test_actions_and_states_are_those_of_the_rows_under_their_names(tmp_path: Pa
             parquet.write_table(table.set_column(place, "action", column), file)
             return get("/0/episodes/2")
 
-        told = failure(answer([1.0], [1.0, 2.0]), 500)
-        assert "file-000.parquet: action: expected as many numbers in each row" in told
-        assert answer(1.0, 2.0).json()["motion"] == {"state": motion["state"]}
+        nulls = [None] * (len(table) - 1)  # in all rows but the last
+        no_vectors: list[list[Any]] = [[[1.0], [1.0, 2.0]], [None, [1.0, 2.0]], [*nulls, [1.0]], [1.0, 2.0]]
+        for values in no_vectors:
+            assert answer(*values).json()["motion"] == {"state": motion["state"]}
 
 
 def rlds(folder: Path) -> Path:
@@ -568,6 +569,32 @@ def test_names_and_tasks_are_shown_as_they_are_now_and_labels_follow_the_names(t
         overridden = open_dataset(root, task=given, override_task=True)
         label(overridden, BrightnessScorer(), LabelOptions(overwrite=True))
         assert {row["task"] for row in rows().values()} == {given}
+
+
+def test_tasks_are_those_of_the_reader_or_of_the_table_that_was_opened(tmp_path: Path) -> None:
+    reader, folder = at_another_rate(tmp_path).split("=")
+    other = Path(folder) / "other.csv"
+    other.write_text("video,task\n0.mp4,open the drawer\n1.mp4,close it\n")
+    with serving(f"{reader}={folder}", other) as get:
+        for foreign in ("video,task\n0,push\n0.mp4,push\n", "id,task\n1,push\n"):
+            (Path(folder) / "tasks.csv").write_text(foreign)
+            told = [[row["task"] for row in get(f"/{number}").json()["episodes"]] for number in range(2)]
+            assert told == [["", ""], ["open the drawer", "close it"]]
+
+
+@pytest.mark.parametrize(
+    "provenance", [{"dataset": "org/name"}, {"dataset": {"task": "push"}}, {"dataset": {"task": {}}}]
+)
+def test_the_provenance_of_another_writer_may_have_other_parts(
+    folders: list[Path], tmp_path: Path, provenance: dict[str, Any]
+) -> None:
+    root = Path(shutil.copytree(folders[V21], tmp_path / "copy"))
+    file = root / "rfm_progress.parquet"
+    others = {"rfm.provenance": json.dumps({**provenance, "checkpoint": "a", "orientations": "b", "channels": "c"})}
+    parquet.write_table(parquet.read_table(file).replace_schema_metadata(others), file)
+    with serving(root) as get:
+        told = get("/0").json()
+    assert [row["task"] for row in told["episodes"]] == [each.task for each in LeRobotDataset(root).episodes]
 
 
 def test_labels_of_others_may_lack_success_and_rows_and_tell_which_frames_the_model_skipped(tmp_path: Path) -> None:

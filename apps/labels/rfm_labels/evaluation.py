@@ -105,11 +105,13 @@ def evaluate_labels(files: Sequence[Path], outcomes: Mapping[Any, bool | None] |
     outcomes: as ``read_outcomes`` returns them: True for success; None, or no entry, to leave the episode out; None:
         unknown
 
-    Raises DatasetError if a file is unreadable, the files share no episode, or no episode has an outcome.
+    Raises DatasetError if a file is unreadable, the files share no episode or name one differently, or no episode has
+    an outcome.
     """
     require("labels", len(files) > 0, "at least one file", "none")
     names = _names(files)
     read = {name: _episodes(file) for name, file in zip(names, files, strict=True)}
+    own = read_names(*files)
     common = sorted(set.intersection(*(set(episodes) for episodes in read.values())))
     everywhere = set.union(*(set(episodes) for episodes in read.values()))
     require("labels", len(common) > 0, "an episode that all files have", "none")
@@ -118,7 +120,6 @@ def evaluate_labels(files: Sequence[Path], outcomes: Mapping[Any, bool | None] |
     if outcomes is not None:
         known = [episode for episode in common if outcomes.get(episode) is not None]
         if not known:
-            own = read_names(*files)
             got = f"none for {in_all} episodes: {first_names([named(each, own.get(each)) for each in common])}"
             got += f"; no labels for {first_names(without_labels)}" if without_labels else ""
             raise DatasetError.at("outcome", "one that is known", got)

@@ -127,9 +127,17 @@ def read_provenance(file: Path) -> dict[str, Any]:
 
 
 def read_names(*files: Path) -> dict[int, str]:
-    """Read the names of the label files' episodes by number; empty for LeRobot's. Raises DatasetError."""
-    names = (parsed_object(_metadata(file).get(NAMES_KEY)) for file in files)
-    return {int(number): str(name) for each in names for number, name in each.items()}
+    """Read the names of the label files' episodes by number; empty for LeRobot's.
+
+    Raises DatasetError, also if a number has another name in another file.
+    """
+    known: dict[int, tuple[str, Path]] = {}
+    for file in files:
+        for number, name in parsed_object(_metadata(file).get(NAMES_KEY)).items():
+            there, first = known.setdefault(int(number), (str(name), file))
+            got = f"{name}: label again with the older file's --name, or choose one file with --labels"
+            require(f"{file}: episode {number}", str(name) == there, f"{there} as in {first}", got)
+    return {number: name for number, (name, _) in known.items()}
 
 
 def _provenance(metadata: Mapping[bytes, bytes]) -> dict[str, Any]:

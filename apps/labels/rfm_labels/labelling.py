@@ -19,7 +19,7 @@ from rfm_client.options import counted
 from rfm_labels.audit import doubts_of_files
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER, Dataset
 from rfm_labels.datasets.faults import DatasetError, shortened
-from rfm_labels.label_files import LabelFile
+from rfm_labels.label_files import LabelFile, reward_name
 from rfm_labels.metadata import PROGRESS, SCORES, blank_from_metadata, blank_lines, skipping_in, values_of
 from rfm_labels.options import DEFAULTS, QUIET, LabelOptions, Watch
 from rfm_labels.plan import Plan, checked_episodes, part_key, plan_labels
@@ -153,7 +153,8 @@ class Outputs:
         """Return the parts with all labels of a file, from which the run that made it writes it again; empty: none."""
         keys = {part_key(*each) for each in file.digests.items()}
         own = self.folder / f".{self.options.name}_parts"  # an alias has none
-        there = map(str, sorted(self.folder.glob(".*_parts"), key=lambda folder: (folder != own, folder)))
+        found = sorted(self.folder.glob(".*_parts"), key=lambda folder: (folder != own, folder))
+        there = [str(folder) for folder in found if folder.is_dir() and os.access(folder, os.R_OK)]
         places = [self.options.parts] if self.options.parts else there
         return next((place for place in places if keys and keys <= Parts(place).keys()), "")
 
@@ -168,9 +169,12 @@ class Outputs:
             raise DatasetError.at(self.folder, "a folder for the labels", got) from error
 
     def before(self, alias: str = "") -> list[LabelFile]:
-        """Return the existing label files; with an alias, only its file."""
-        files = [self.folder / f"{self.prefix}{alias}.parquet"] if alias else [*self.progress, *self.signals]
-        return [LabelFile.read(path) for path in files if path.exists()]
+        """Return the existing label files; with an alias, those of the label that its file belongs to."""
+        file = self.folder / f"{self.prefix}{alias}.parquet"
+        if alias and file.exists():
+            label_of = replace(self.options, name=reward_name(Path(f"{alias}.parquet")))
+            return replace(self, options=label_of).before() or [LabelFile.read(file)]
+        return [LabelFile.read(path) for path in [*self.progress, *self.signals] if path.exists()]
 
     def write(self, plan: Plan, labels: Any) -> list[Path]:
         """Write the labels, a table from ``Parts.read_all``, to all files, and return their paths. Raises OSError."""

@@ -119,9 +119,8 @@ class ShownDataset:
         unused = self.dataset.unused_cameras(self.dataset.cameras)
         rows = {} if summary is None else dict(zip(summary.episodes.tolist(), _rows(summary), strict=True))
         provenance = None if file is None else read_provenance(file)
-        given = ((provenance or {}).get("dataset") or {}).get("task") or {"text": "", "overrides": False}
-        checkpoint = (provenance or {}).get("checkpoint")  # of another writer, perhaps a text
-        digest = checkpoint.get("weights_digest") if isinstance(checkpoint, dict) else None
+        given = {"text": "", "overrides": False} | _part(_part(provenance, "dataset"), "task")
+        digest = _part(provenance, "checkpoint").get("weights_digest")
         return {
             "labels": None if file is None else self._name_of(file),
             "cameras": list(self.cameras),
@@ -273,8 +272,8 @@ class ShownDataset:
         if file is None:
             return self.dataset.corrections.get(camera, Correction())
         provenance = read_provenance(file)
-        orient = provenance.get("orientations", {}).get(camera)  # labels from version 0.1.0 have none
-        order = provenance.get("channels", {}).get(camera)
+        orient = _part(provenance, "orientations").get(camera)  # labels from version 0.1.0 have none
+        order = _part(provenance, "channels").get(camera)
         is_known = orient in get_args(Orientation), order in get_args(ChannelOrder)
         return Correction(orient if is_known[0] else "none", order if is_known[1] else "rgb")
 
@@ -287,6 +286,12 @@ def _summary(file: Path, _changed_ns: int) -> tuple[Summary, Mapping[str, int]]:
     """Return a label file's summary, and the numbers of its episodes with names by name."""
     summary = summarise(file)
     return summary, {name: number for number, name in summary.names.items()}
+
+
+def _part(document: Mapping[str, Any] | None, name: str) -> Any:
+    """Return a dict in the provenance; empty if there is none, or another writer's text."""
+    part = (document or {}).get(name)
+    return part if isinstance(part, dict) else {}
 
 
 def _rows(summary: Summary) -> list[dict[str, Any]]:

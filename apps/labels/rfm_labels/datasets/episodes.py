@@ -220,7 +220,7 @@ class EpisodeDataset(RecordedDataset):
     """The episodes that a reader yields.
 
     root: folder with the recordings
-    where: what the tasks come from, for messages
+    where: the table of tasks, the folder that may get one, or the reader's name
 
     Raises DatasetError for a name twice, functions that several episodes share, and too large arrays.
     """
@@ -230,12 +230,13 @@ class EpisodeDataset(RecordedDataset):
         episodes: Iterable[Episode],
         root: Path,
         kind: str,
-        where: object,
+        where: Path | str,
         task: TaskOverride,
         corrections: AskedCorrections,
         notes: Sequence[str] = (),
     ) -> None:
         self.root, self.source, self.kind, self.given_task, self.notes = root, root.resolve().name, kind, task, notes
+        self._tasks_from = where
         opened, names, recorded = lru_cache(_FILES_AT_A_TIME)(Video), set[str](), dict[int, Recorded]()
         num_bytes, functions, rates = 0, dict[object, str](), list[float | None]()
         variables: list[tuple[str, CellType, object]] = []
@@ -269,6 +270,6 @@ class EpisodeDataset(RecordedDataset):
 
     @property
     def listing(self) -> Sequence[DatasetEpisode]:
-        table = self.root / TABLE
-        tasks = read_table_of_tasks(table, has_tasks=False) if table.is_file() else {}
+        table = self.root / TABLE if self._tasks_from == self.root else self._tasks_from
+        tasks = read_table_of_tasks(table, has_tasks=False) if isinstance(table, Path) and table.is_file() else {}
         return [replace(each, task=tasks.get(each.name) or each.task) for each in self.episodes]

@@ -215,10 +215,11 @@ class LeRobotDataset(Dataset):
         table = read_table(file, list(columns.values()), own) if columns else {}
         found = {}
         for name, column in columns.items():
-            try:
-                values = np.stack(table[column].to_numpy()).astype(np.float64)
-            except ValueError as error:
-                raise DatasetError.at(f"{file}: {column}", "as many numbers in each row", error) from error
+            rows = table[column].to_numpy()
+            shapes = {np.shape(row) for row in rows}
+            if len(shapes) != 1 or () in shapes:  # ragged rows, or null ones
+                continue
+            values = np.stack(rows).astype(np.float64)
             names = self.info.names.get(column, [])
             usual = list(map(str, range(values.shape[1])))
             found[name] = Motion(names if len(names) == len(usual) else usual, values)
