@@ -23,7 +23,7 @@ const LOW_WITH_SUCCESS = { leading: [0.46, 0.98], success: [0.03, 0.36] };
 const WITHOUT_SUCCESS = { leading: [0.03, 0.98] };
 const HALVING_PX = 200; // turns of the wheel that halve the time that is shown
 const MOST_ZOOM = 500;
-const GAP = 0.06; // of the height, between progress and what other models predict in place of it
+const [GAP, LOW_GAP] = [0.06, 0.12]; // of the height, between progress and what other models predict in place of it
 
 /** The name of the colour of curve number `index`, which the style sheet has for each theme. */
 export function colourName(index) {
@@ -46,9 +46,10 @@ export function panesOf(curves, isLow = false) {
   const { leading, success } = !hasSuccess ? WITHOUT_SUCCESS : isLow ? LOW_WITH_SUCCESS : WITH_SUCCESS;
   const signals = [...new Set(curves.map(leadingOf))].sort();
   if (!signals.length) signals.push("progress");
-  const height = (leading[1] - leading[0] - GAP * (signals.length - 1)) / signals.length;
+  const gap = isLow ? LOW_GAP : GAP;
+  const height = (leading[1] - leading[0] - gap * (signals.length - 1)) / signals.length;
   const panes = signals.map((signal, place) => {
-    const to = leading[1] - place * (height + GAP);
+    const to = leading[1] - place * (height + gap);
     return [signal, { from: to - height, to, scale: scaleOf(signal, curves) }];
   });
   if (success) panes.push(["success", { from: success[0], to: success[1], scale: scaleOf("success", curves) }]);
@@ -165,9 +166,12 @@ export class Chart {
     const chosen = this.#chosen(points);
     const named = chosen.length < points.length ? chosen : [];
     this.#dots.replaceChildren(...points.map((point) => this.#dot(point, named.includes(point))).reverse()); // as the lines: the first one on top
+    const ordered = Object.values(this.#panes); // from above
+    const gap = Math.min(...ordered.slice(1).map(({ to }, place) => ordered[place].from - to)) * this.#plot.over.clientHeight;
+    const beyond = Math.min(VALUE_PX, gap - VALUE_PX) / 2; // of its pane, so that no number hides one of another pane
     const numbers = Object.entries(this.#panes).flatMap(([signal, { scale }]) => {
       const [lowest, highest] = scale.map((value) => this.#top(signal, value));
-      return apart(chosen.filter((point) => point.signal === signal), highest - VALUE_PX / 2, lowest + VALUE_PX / 2);
+      return apart(chosen.filter((point) => point.signal === signal), highest - beyond, lowest + beyond);
     });
     this.#values.replaceChildren(...numbers.map(({ curve, signal, value, top }) => {
       const element = document.createElement("span");
@@ -350,9 +354,12 @@ function made(name) {
   return element;
 }
 
-/** Those numbers that fit between two heights, moved so that none hides another. Each has the height of its middle as `top`. */
+/**
+ * Those numbers that fit between two heights, moved so that none hides another. Each has the height of its middle as
+ * `top`; on the same pixel they keep their order.
+ */
 function apart(labels, from, to) {
-  const placed = [...labels].sort((one, other) => one.top - other.top).slice(0, Math.floor((to - from) / VALUE_PX) + 1);
+  const placed = [...labels].sort((one, other) => Math.round(one.top) - Math.round(other.top)).slice(0, Math.floor((to - from) / VALUE_PX) + 1);
   let free = from;
   for (const each of placed) {
     each.top = Math.max(each.top, free);

@@ -278,6 +278,7 @@ export class DatasetTab {
     page["filter-differ"].hidden = !other;
     if (!other) page["only-differ"].checked = false;
     page["episode-list"].classList.toggle("beside", Boolean(other));
+    page["episode-list"].classList.toggle("one-camera", this.#told.cameras.length < 2);
     page.ends.hidden = !isLabelled;
     const leftOut = Object.entries(this.#told.left_out).map(([camera, reason]) => `${short(camera)} is left out: ${reason}`);
     page["left-out"].textContent = leftOut.join("; ");

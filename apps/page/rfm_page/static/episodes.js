@@ -170,7 +170,7 @@ export class EpisodeTable {
     header.prepend(...pictures);
     row.cells[PROGRESS].prepend(curve);
     this.#previews.fill(episode, row, pictures, curve);
-    row.append(cell(percent(episode.backwards), "number"), cell(shown(episode.disagreement), "number"));
+    row.append(cell(percent(episode.backwards), "number"), cell(shown(episode.disagreement), "number cameras"));
     row.append(cell(`${shown(episode.difference)}${episode.verdict_differs ? " ≠" : ""}`, "number difference"));
     row.addEventListener("click", () => this.#onWatch(episode));
     this.#markRow(row, episode);

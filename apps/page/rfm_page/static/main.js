@@ -476,7 +476,9 @@ function update() {
   }
   showTable(page.curves, curves, Number(page.threshold.value));
   page.stop.disabled = queue.isIdle && !comparing;
-  page.compare.disabled = videos.all.length < 2 || !page.model.value || Boolean(comparing);
+  page.compare.hidden = videos.all.length < 2 || !page.model.value;
+  page.compare.disabled = Boolean(comparing);
+  page.compare.textContent = comparing ? `Comparing ${videos.all.length} videos…` : "Compare videos";
   page.take.hidden = !scored.length && !answered().length;
   page.verdicts.hidden = !verdicts.length;
   page.png.disabled = page.svg.disabled = page.csv.disabled = !scored.length;

@@ -20,6 +20,7 @@ export class Timeline {
   #button;
   #told;
   #curves = [];
+  #points = []; // times at which a curve has a point
   #charts;
   time = 0;
 
@@ -43,6 +44,7 @@ export class Timeline {
   /** Draws the curves, and lets the controls reach the end of them. motion: curves of the robot, beside them */
   show(curves, motion = []) {
     this.#curves = curves.map(answeredOf).filter(({ times }) => times.length);
+    this.#points = [...new Set(this.#curves.flatMap((curve) => curve.times))].sort((one, other) => one - other);
     [this.#curves, motion].forEach((each, place) => this.#charts[place]?.show(each));
     this.#slider.disabled = this.#button.disabled = !this.#curves.length;
     this.#slider.max = Math.max(0, ...this.#curves.map(({ allTimes }) => allTimes.at(-1))) || 1;
@@ -62,7 +64,9 @@ export class Timeline {
     this.#slider.value = this.time;
     this.#told.textContent = this.#slider.disabled ? "" : `${this.time.toFixed(2)} / ${Number(this.#slider.max).toFixed(2)} s`;
     this.#slider.setAttribute("aria-valuetext", [`${this.time.toFixed(2)} seconds`, ...this.#numbers()].join("; "));
-    for (const chart of this.#charts) chart.moveTo(this.time);
+    const points = this.#points;
+    const at = points[pointAt(points, this.time)] ?? this.time; // between two points there is no number
+    for (const chart of this.#charts) chart.moveTo(at);
   }
 
   /** What stands beside the lines, for somebody who hears the page. */
@@ -75,7 +79,9 @@ export class Timeline {
 
   #pointedAt(seconds, isDragged) {
     if (isDragged) this.videos.pause();
-    if (!this.videos.isPlaying) this.moveTo(seconds);
+    if (this.videos.isPlaying) return;
+    const distance = (point) => Math.abs(point - seconds);
+    this.moveTo(this.#points.reduce((one, other) => (distance(other) < distance(one) ? other : one), this.#points[0] ?? seconds));
   }
 
   #play() {
@@ -98,10 +104,9 @@ export class Timeline {
 
   /** Moves to the next point of any curve, or to the one before. */
   #step(direction) {
-    const times = [...new Set(this.#curves.flatMap((curve) => curve.times))].sort((one, other) => one - other);
     const next = direction > 0
-      ? times.find((each) => each > this.time + NEAR_S)
-      : times.findLast((each) => each < this.time - NEAR_S);
+      ? this.#points.find((each) => each > this.time + NEAR_S)
+      : this.#points.findLast((each) => each < this.time - NEAR_S);
     if (next !== undefined) this.moveTo(next);
   }
 }

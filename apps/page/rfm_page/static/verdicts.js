@@ -14,8 +14,8 @@ export function sentenceOf({ videos, answer }) {
   if (answer.pairs.every(({ verdict }) => verdict)) return `${videos[best].title} does the task ${videos.length > 2 ? "best" : "better"}.`;
   const [{ orders_agree: agree }, ...others] = answer.pairs;
   const unranked = videos.filter((_, index) => answer.videos[index].rank === null).map(({ title }) => title).join(", ");
-  if (others.length) return `${best < 0 ? "No best video" : `${videos[best].title} does the task best, but ${unranked} have no rank`}: some answers change with the order.`;
-  return agree ? "No verdict: both answers are exactly 0.5." : "No verdict: the answer changes with the order.";
+  if (others.length) return `${best < 0 ? "No best video" : `${videos[best].title} does the task best, but ${unranked} have no rank`}: some answers depend on which video comes first.`;
+  return agree ? "No verdict: both answers are exactly 0.5." : "No verdict: the answer depends on which video comes first.";
 }
 
 /** Writes the verdict on videos into `host`, with the sentence as its title, and returns the box. */
@@ -23,7 +23,7 @@ export function addVerdict(host, verdict) {
   const { videos, task, model, answer } = verdict;
   const box = document.createElement("div");
   const agree = answer?.pairs.every(({ verdict: better }) => better) ? ` ${videos.length > 2 ? "All" : "Both"} orders agree.` : "";
-  const about = answer ? `${task} (${model}).${agree}` : "The files have the same bytes. The model was not asked.";
+  const about = answer ? `${task}, judged by ${model}.${agree}` : "The files have the same bytes. The model was not asked.";
   box.className = "verdict";
   box.append(element("h2", sentenceOf(verdict).replace(/\.$/, "")), element("p", about));
   box.lastChild.className = "about";
@@ -42,7 +42,7 @@ function rankingOf(videos, answer) {
     share.style.width = `${100 * wins}%`;
     share.style.background = video.colour ?? `var(--${colourName(video.place)})`;
     bar.append(share);
-    item.append(element("span", `${rank ?? "?"} ${video.title}`), bar, element("span", `P(wins) = ${shown(wins)}`));
+    item.append(element("span", rank ? `${rank} ${video.title}` : `${video.title} (no rank)`), bar, element("span", `wins ${shown(wins)}`));
     list.append(item);
   }
   return list;

@@ -13,6 +13,10 @@ const UNSHOWN = { // by the state of its curve
   failed: "This browser cannot show this file, and it was not scored: see the numbers below.",
 };
 const NEAR_S = 0.05; // a video that is so near to a time shows it
+const IN_STEP_S = 0.015; // less than half a frame of most cameras
+const NEAR_LEADER_S = 0.2; // so near, the frames that are drawn count, else the times
+const CATCH_UP = 4; // in a second, a video that lags makes up for so many times its lag
+const SLOWEST = 0.1; // times the usual speed
 const INSIDE_S = 0.001; // behind the begin of a frame, so that rounding does not show the one before
 
 /**
@@ -57,6 +61,11 @@ export class Videos {
     caption.append(entry.swatch, ...(this.#changing ? this.#controls(entry) : [name]));
     player.addEventListener("play", () => this.#follow(entry));
     player.addEventListener("seeked", () => this.#arrived(entry));
+    const drawn = (_, { mediaTime }) => {
+      entry.drawn = mediaTime;
+      player.requestVideoFrameCallback(drawn);
+    };
+    player.requestVideoFrameCallback?.(drawn);
     figure.append(caption, player, trouble);
     this.#host.append(figure);
     this.#entries = [...this.#entries, entry]; // whoever has `all` keeps that list
@@ -111,9 +120,10 @@ export class Videos {
     }
   }
 
-  /** Plays all videos from the time at which they are; from the start where they have ended. */
+  /** Plays all videos from the time at which they are, but for those that have ended; from the start if all have. */
   play() {
-    for (const { player } of this.#entries) player.play().catch(() => {}); // one that cannot be shown says so itself
+    const going = this.#entries.filter(({ player }) => !player.ended && !player.error);
+    for (const { player } of going.length ? going : this.#entries) player.play().catch(() => {}); // one that cannot be shown says so itself
   }
 
   pause() {
@@ -180,10 +190,11 @@ export class Videos {
   #follow(entry) {
     const step = () => {
       if (entry.player.paused || entry.player.ended) {
-        if (!this.isPlaying && entry.wanted === null) this.#onTime(entry.player.currentTime, entry); // where it stopped
+        if (!this.isPlaying && entry.wanted === null) this.#onTime(entry.player.currentTime); // all stop where it stopped
         return;
       }
       const leader = this.#entries.find(({ player }) => !player.paused && !player.ended);
+      entry.player.playbackRate = rateOf(entry, leader);
       if (leader === entry && entry.wanted === null) this.#onTime(entry.player.currentTime, entry);
       requestAnimationFrame(step);
     };
@@ -194,6 +205,14 @@ export class Videos {
 function show(entry, { orient, channels }) {
   Object.assign(entry, { orient, channels });
   entry.player.className = `${orient} ${channels}`;
+}
+
+/** The speed at which a video comes to show the same moment as the leader: browsers draw frames up to one frame early or late. */
+function rateOf(entry, leader) {
+  const lag = leader.player.currentTime - entry.player.currentTime;
+  const drawnLag = leader.drawn - entry.drawn; // NaN where a browser does not tell
+  const counted = Math.abs(lag) < NEAR_LEADER_S && Number.isFinite(drawnLag) ? drawnLag : lag;
+  return Math.abs(counted) < IN_STEP_S ? 1 : Math.min(Math.max(1 + CATCH_UP * counted, SLOWEST), CATCH_UP);
 }
 
 /** Ends a player's load, then gives its file back: a load that finds it gone would be an error. */
