@@ -73,7 +73,8 @@ def proxy(nginx: str, folder: Path, ports: dict[str, int]) -> Iterator[None]:
         text, count = re.subn(rf"([ :]){PORTS[name]}([ ;])", rf"\g<1>{port}\2", text)
         assert count, name
     text = (
-        text.replace("listen ", f"listen {IP}:")
+        re.sub(r"listen (?=\d)", f"listen {IP}:", text)
+        .replace("listen [::]:", "listen [::1]:")
         .replace("/etc/", f"{folder}/etc/")
         .replace("/var/log/nginx/", f"{folder}/")
     )
