@@ -148,5 +148,6 @@ def rollback(name: ExportedName, server: AdministeredRepository) -> None:
 
 
 def _roll_out(server: AdministeredRepository, name: str, api: RepositoryApi, version: int) -> None:
+    api.check_api_key()  # which the probes need
     Rollout(server.repository, name, api, typer.echo).to(version)
     typer.echo(f"{name}: version {version} is served")

@@ -132,6 +132,10 @@ class RepositoryApi:
             time.sleep(POLL_S)
         raise RepositoryApiError.at(model, f"its old versions to finish within {FINISH_S:g} s", "no end")
 
+    def check_api_key(self) -> None:
+        """Raise RepositoryApiError unless callers with this API key may score."""
+        self._request(self._client.get_system_shared_memory_status)
+
     def infer(self, model: str, version: int, inputs: Tensors, outputs: Collection[str]) -> Tensors:
         """Return a version's outputs for a probe. The request id distinguishes probes from callers' requests."""
         tensors = []
@@ -154,7 +158,7 @@ class RepositoryApi:
         except InferenceServerException as error:
             message = one_line(error.message() or "no reason given")
             if triton.RESTRICTED in message:
-                key, header, options = _KEYS[call == self._client.infer]
+                key, header, options = _KEYS[call in (self._client.infer, self._client.get_system_shared_memory_status)]
                 got = "another" if f"{triton.METADATA_PREFIX}{header}" in self._headers else "none"
                 raise RepositoryApiError.at(key, f"that of the server at {self._url} ({options})", got) from None
             ours = triton.error_from(error, self._url)

@@ -195,4 +195,4 @@ def test_a_client_names_the_fault_of_a_description_and_its_remedy(text: str, exp
         InferenceFailedError,
         match=rf"^model rfm: config\.pbtxt: parameter description: {expected}.*; export the checkpoint again",
     ):
-        ModelInfo.from_config(config)
+        ModelInfo.from_config(config, ["1"])

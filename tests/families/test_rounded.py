@@ -181,7 +181,7 @@ def info_of(model: Path) -> ModelInfo:
     from google.protobuf.json_format import MessageToDict
 
     config = parse((model / "config.pbtxt").read_text())
-    return ModelInfo.from_config(MessageToDict(config, preserving_proto_field_name=True))
+    return ModelInfo.from_config(MessageToDict(config, preserving_proto_field_name=True), ["1"])
 
 
 def numbers_of(engine: Engine) -> Mapping[str, int]:

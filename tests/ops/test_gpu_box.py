@@ -73,7 +73,8 @@ def proxy(nginx: str, folder: Path, ports: dict[str, int]) -> Iterator[None]:
         text, count = re.subn(rf"([ :]){PORTS[name]}([ ;])", rf"\g<1>{port}\2", text)
         assert count, name
     text = (
-        text.replace("listen ", f"listen {IP}:")
+        re.sub(r"listen (?=\d)", f"listen {IP}:", text)
+        .replace("listen [::]:", "listen [::1]:")
         .replace("/etc/", f"{folder}/etc/")
         .replace("/var/log/nginx/", f"{folder}/")
     )
@@ -101,9 +102,9 @@ def test_nginx_passes_on_the_requests_that_scoring_needs_with_a_key_and_nothing_
     alice, bob = ((papers / "keys" / f"{name}.key").read_text().strip() for name in ("alice", "bob"))
     context, port = ssl.create_default_context(cafile=authority), Endpoints.free().http_port
 
-    def client(scheme: str, host: str = NAME, **options: Any) -> RewardClient:
+    def client(scheme: str, **options: Any) -> RewardClient:
         return RewardClient(
-            f"{scheme}://{host}:{port}", **{"ca_file": authority, "api_key": alice, "retry": False, **options}
+            f"{scheme}://{NAME}:{port}", **{"ca_file": authority, "api_key": alice, "retry": False, **options}
         )
 
     def http(**headers: str) -> httpx.Client:
@@ -131,8 +132,7 @@ def test_nginx_passes_on_the_requests_that_scoring_needs_with_a_key_and_nothing_
                 np.testing.assert_allclose(got.progress, expected.progress, atol=TOLERANCE)  # type: ignore[union-attr]
                 denied = ({"api_key": None}, {"api_key": alice[:-1]}, {"ca_file": None})
                 for options in denied:
-                    # by address, since a name may have a second address, where nobody listens
-                    with client(scheme, IP, **options) as asked, pytest.raises(AccessDeniedError):
+                    with client(scheme, **options) as asked, pytest.raises(AccessDeniedError):
                         asked.progress(FILMED)
             address, shown = f"{NAME}:{port}", {"authorization": f"Bearer {alice}"}
             with closing(InferenceServerClient(address, ssl=True, root_certificates=authority)) as asking:
@@ -199,4 +199,7 @@ def test_the_systemd_unit_runs_rfm_serve_as_nginx_and_the_guide_expect() -> None
     given = rfm_parsed(name, *arguments)
     assert (program, name, given["gateway_port"]) == ("/opt/rfm/bin/rfm", "serve", PORTS["gateway"])
     assert (given["http_port"], given["grpc_port"]) == (None, None)  # Triton's own
+    credential, _, key_file = parser["Service"]["loadcredential"].partition(":")
+    assert given["admin_key_file"] == Path("${CREDENTIALS_DIRECTORY}") / credential
+    assert f" {key_file} " in GUIDE
     assert f"--repository {arguments[0]} " in GUIDE

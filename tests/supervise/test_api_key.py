@@ -21,7 +21,7 @@ from gateways import answers
 from in_process import rfm
 from rfm.serve.access import Endpoints, callers_restrictions, free_ports
 from rfm.serve.installation import find_installation
-from rfm.serve.repository_api import RepositoryApi, RepositoryApiError
+from rfm.serve.repository_api import RepositoryApi
 from rfm.serve.triton_server import TritonServer
 from rfm_client import AccessDeniedError, ProgressSample, RewardClient
 from rfm_client.contract.triton import bearer_headers
@@ -58,13 +58,11 @@ def test_one_key_opens_every_door_and_none_opens_without_it(tmp_path: Path) -> N
         np.testing.assert_allclose(curves[1:], curves[:1] * 2, atol=1e-5)
 
         tensors, grpc = encode_samples([ProgressSample(TRAJECTORY)]), served.endpoints.grpc_url
-        for headers, told in (({}, "none"), (bearer_headers("another"), "another")):
-            with RepositoryApi(grpc, KEY, headers=headers) as api, pytest.raises(RepositoryApiError) as caught:
-                api.infer("rfm", 1, tensors, [PROGRESS])
-            expected = (
-                f"API key: expected that of the server at {grpc} (--api-key-file or RFM_API_KEY_FILE), got {told}"
-            )
-            assert str(caught.value) == expected
+        rollout = ["models", "rollout", "rfm", "1", "--repository", str(repository), "--url", grpc]
+        for option, told in (([], "none"), (["--api-key-file", str(tmp_path / "key")], "another")):
+            done = rfm(*rollout, "--admin-key-file", str(tmp_path / "key"), *option)
+            expected = f"expected that of the server at {grpc} (--api-key-file or RFM_API_KEY_FILE), got {told}"
+            assert (done.stdout, done.stderr) == ("", f"rfm: API key: {expected}\n")  # nothing was loaded
         with RepositoryApi(grpc, KEY, headers=bearer_headers(API_KEY)) as api:
             assert api.infer("rfm", 1, tensors, [PROGRESS])[PROGRESS].shape[0] == 1
 

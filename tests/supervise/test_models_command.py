@@ -160,6 +160,8 @@ def test_a_broken_version_is_never_asked_and_a_good_one_is_rolled_out(running: R
         running.export_plain(name)
         assert running.models("rollout", name, "3").endswith(f"{name}: version 3 is served\n")
         assert (running.served_by_restart(name), running.ready(name)) == ([3], ["3"])
+        with running.client(name) as client:
+            assert client.model_info().versions == ("3",)  # Triton's configuration names 1, too
         wait_for(lambda: tally.by_version["3"])
     assert (tally.failed, tally.unlike, set(tally.by_version)) == ([], [], {"1", "3"})
     with running.client(NAME) as client:

@@ -91,17 +91,21 @@ class Evaluator:
         flat = chain.from_iterable(asked)
         outcomes = iter(await self.client.evaluate(flat, return_errors=True, request_id=request_id))
         results = _results([list(islice(outcomes, len(of_sample))) for of_sample in asked], batch)
-        group = 1 if frames is None or use_frame_steps else await self._frames_per_value(results)
+        group = 1 if frames is None or use_frame_steps else await self._frames_per_value(frames, results)
         return _answer(batch.samples, results, group), warning
 
-    async def _frames_per_value(self, results: Sequence[Result]) -> int:
-        """Return how many frames share a value. Raises ServerUnavailableError while another version is loaded."""
-        info = await self.client.model_info(frames=True)
-        unknown = {str(result.model_version) for result in results} - set(info.versions)
-        if info.versions and unknown:
-            fault = f"model_version: expected one of {', '.join(info.versions)}, got {', '.join(sorted(unknown))}"
-            raise ServerUnavailableError(f"{fault}: the checkpoint is being replaced, try again")
-        return info.frames_per_value
+    async def _frames_per_value(self, before: ModelInfo, results: Sequence[Result]) -> int:
+        """Return how many frames share a value, in the version that is served now or was served ``before``.
+
+        Raises ServerUnavailableError if neither answered.
+        """
+        now = await self.client.model_info(frames=True)
+        answered = {str(result.model_version) for result in results}
+        for info in (now, before):
+            if answered <= {*info.versions}:
+                return info.frames_per_value
+        fault = f"model_version: expected one of {', '.join(now.versions)}, got {', '.join(sorted(answered))}"
+        raise ServerUnavailableError(f"{fault}: the checkpoint is being replaced, try again")
 
     async def _served(self, samples: Sequence[schema.Sample]) -> tuple[ModelInfo | None, ModelInfo | None]:
         """Return the models for embeddings and for raw frames that can score the samples; None: not served, or unused.

@@ -7,7 +7,7 @@ import json
 import re
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias, cast
 
@@ -220,7 +220,7 @@ def _read(name: str, value: Any, kind: Any) -> Any:
 class ModelInfo(Description):
     """A served model. Facts about its checkpoint: as in ``Description`` and ``Origin``.
 
-    versions: versions that its configuration requests; empty: the latest
+    versions: versions that are ready; the highest answers
     max_batch_size: most samples in a request
     by_digest: True if the model accepts frame references
     instances: how many a server runs; 0: an ensemble, whose parts have instances
@@ -240,8 +240,8 @@ class ModelInfo(Description):
             raise InvalidSampleError.at(f"model {self.name}", expected, got)
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> ModelInfo:
-        """Read Triton's model configuration, in the HTTP API's form.
+    def from_config(cls, config: Mapping[str, Any], versions: Iterable[str]) -> ModelInfo:
+        """Read Triton's model configuration, in the HTTP API's form. Its version policy may be that of an earlier load.
 
         Raises InferenceFailedError for a model without an export's description; ValueError, LookupError or TypeError
         for an answer that is not a configuration.
@@ -252,11 +252,10 @@ class ModelInfo(Description):
         except ValueError as error:
             remedy = "export the checkpoint again with the version of rfm that serves it"
             raise InferenceFailedError(f"model {config['name']}: config.pbtxt: {error}; {remedy}") from error
-        versions = config.get("version_policy", {}).get("specific", {}).get("versions", [])
         return cls(
             **vars(description),
             name=config["name"],
-            versions=tuple(str(version) for version in versions),
+            versions=tuple(versions),
             max_batch_size=int(config["max_batch_size"]),
             by_digest=any(tensor["name"] == wire.FRAME_DIGESTS for tensor in config["input"]),
             instances=num_instances(config),

@@ -119,8 +119,10 @@ class TritonTransport:
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
         async def request(client: Any) -> ModelInfo:
+            # Before the configuration: a version that becomes ready in between makes callers ask again.
+            versions = (await client.get_model_metadata(model, **self.as_json))["versions"]
             config = await client.get_model_config(model, **self.as_json)
-            return ModelInfo.from_config(config.get("config", config))  # nested in gRPC's answer
+            return ModelInfo.from_config(config.get("config", config), versions)  # nested in gRPC's answer
 
         return await self.call(request, timeout_s, model=model, bad_request=errors.ModelNotFoundError)
 
