@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from rfm.config import ExportConfig
-from rfm.files import ADAPTER_CONFIG, NETWORK_CONFIG, WEIGHTS, WEIGHTS_INDEX
+from rfm.files import CHECKPOINT_FILES
 from rfm.parameters import EXPORT_VERSION
 from rfm.serve.processes import ProcessGroup, how_it_ended
 from rfm.serve.repository import CONFIG_FILE, models_in
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
 CACHE = Path(".cache")  # in the home folder, as the XDG base directory specification says
 DIGEST_DIGITS = 12
-_CHECKPOINT_FILES = (WEIGHTS, WEIGHTS_INDEX, NETWORK_CONFIG, ADAPTER_CONFIG)
-_PARTS = ("image_encoder", "text_encoder", "base_model")  # settings that name more files to read
 
 
 def is_checkpoint(word: str) -> bool:
@@ -43,7 +41,7 @@ def is_checkpoint(word: str) -> bool:
     folder = Path(word)
     if folder.exists():
         is_served = (folder / CONFIG_FILE).exists() or bool(models_in(folder))
-        return not is_served and any((folder / name).exists() for name in _CHECKPOINT_FILES)
+        return not is_served and any((folder / name).exists() for name in CHECKPOINT_FILES)
     return "/" in word and not word.startswith(("/", ".", "~"))
 
 
@@ -90,8 +88,13 @@ def find_or_export(settings: ExportConfig, folder: Path) -> Path:
     with timed_steps() as begin:
         found, gpus = hub.look(source, tell), num_gpus(settings)
         name = Path(source).expanduser().absolute().name.partition("@")[0]
-        home = folder / f"{name}-{_digest(source, found, settings, gpus)}"
+        digest = _digest(source, found, settings, gpus)
+        home = folder / f"{name}-{digest}"
         repository = home / "models"
+
+        def is_same() -> bool:
+            return _digest(source, hub.look(source, tell), settings, gpus) == digest
+
         if not repository.exists():
             home.mkdir(parents=True, exist_ok=True)
             with alone(home, lambda: say(f"another start exports {source}: waiting")), staging(home, ()) as scratch:
@@ -104,8 +107,13 @@ def find_or_export(settings: ExportConfig, folder: Path) -> Path:
                     if found.missing_bytes:
                         begin("downloading")
                         hub.find(source, tell)
-                    rfm_export.export(source, scratch / "models", settings, say=tell, begin=begin)
-                    (scratch / "models").rename(repository)
+                    if not found.missing_bytes or is_same():
+                        rfm_export.export(source, scratch / "models", settings, say=tell, begin=begin)
+                        if is_same():
+                            (scratch / "models").rename(repository)
+    if not repository.exists():  # a better tag came, or the new files name a folder of this machine
+        say(f"{source}: other files decide its export now: looking again")
+        return find_or_export(settings, folder)
     say(f"{source}: served from its export {repository}")
     return repository
 
@@ -114,8 +122,10 @@ def _digest(source: str, found: Found, settings: ExportConfig, gpus: int) -> str
     """Return digits for all that decides an export. A part on the Hub counts by its name alone."""
     from rfm.published.hub import digests
     from rfm.published.provenance import is_folder, source_name
+    from rfm.published.rewind import IMAGE_ENCODER, TEXT_ENCODER
 
-    parts = [Path(value).expanduser() for name in _PARTS if (value := getattr(settings, name)) and is_folder(value)]
+    named = settings.image_encoder or IMAGE_ENCODER, settings.text_encoder or TEXT_ENCODER, settings.base_model
+    parts = [Path(source).expanduser() for source in named if source and is_folder(source)]
     decides = {
         **vars(settings),
         "checkpoint": source_name(source),

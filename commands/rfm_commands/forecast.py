@@ -64,26 +64,28 @@ def needs(found: Found, settings: ExportConfig, num_gpus: int, cache: Path) -> I
     if found.is_adapter:
         yield Need("memory, disk: those of the adapter's base model")
         return
-    weights = found.weights_bytes * ROUNDED[settings.weights]
-    yield from _disk(download, weights, cache)
+    loaded = found.weights_bytes - (found.float32_bytes or 0) / 2  # in bfloat16
+    weights = loaded * ROUNDED[settings.weights]
+    yield from _disk(download, found.weights_bytes if settings.weights is None else weights, cache)
+    is_known = found.float32_bytes is not None  # else only the line says what is needed
     free = [torch.cuda.mem_get_info(index)[0] for index in range(num_gpus)]
     is_compared_on_gpu = max(free, default=0) >= WORKING_ROOM * found.weights_bytes
-    export = found.weights_bytes * (EXPORT_BESIDE_GPU if is_compared_on_gpu else EXPORT_ON_CPU)
+    export = loaded * (EXPORT_BESIDE_GPU if is_compared_on_gpu else EXPORT_ON_CPU)
     multiple = SERVE_ON_CPU if settings.weights is None else SERVE_ROUNDED_ON_CPU
-    serve = 0 if free else found.weights_bytes * multiple
+    serve = 0 if free else loaded * multiple
     host = psutil.virtual_memory().available
     then = "" if free else f", then {size(serve)} to serve"
     line = f"memory: about {size(export)} to export{then}; {size(host)} are free"
     remedy = "use a machine with more, or with a GPU; rfm export tries it all the same"
-    yield Need(line, PLAINLY * max(export, serve), host, "memory", remedy)
+    yield Need(line, is_known * PLAINLY * max(export, serve), host, "memory", remedy)
     if free:
         name = f"{'GPU' if num_gpus == 1 else f'{num_gpus} GPUs'}: {torch.cuda.get_device_name(0)}"
         line = f"{name}, on which the weights take about {size(weights)}; {size(min(free))} are free"
         smaller = {None: "--weights int8 halves them, or ", "int8": "--weights nf4 takes fewer, or "}
         remedy = f"{smaller.get(settings.weights, '')}name a GPU with more (CUDA_VISIBLE_DEVICES)"
-        yield Need(line, weights, min(free), "GPU memory", remedy)
+        yield Need(line, is_known * weights, min(free), "GPU memory", remedy)
     else:
-        flop = 2 * found.weights_bytes / BYTES_PER_PARAMETER * SAMPLE_TOKENS
+        flop = 2 * loaded / BYTES_PER_PARAMETER * SAMPLE_TOKENS
         seconds = flop / (CORE_FLOP_PER_S * len(os.sched_getaffinity(0)))
         yield Need(f"no GPU: the CPU takes {_duration(seconds)} for a sample with {SAMPLE}, by an estimate")
 

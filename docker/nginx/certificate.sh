@@ -8,6 +8,10 @@ set -eu
 umask 077
 name=$1 ip=$2
 
+if [ -e ca.pem ] && [ ! -e ca.key ]; then
+  echo "certificate.sh: ca.pem is here without ca.key, which signs: bring ca.key back" >&2
+  exit 1
+fi
 [ -e ca.pem ] || openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 3650 \
   -subj "/CN=authority of $name" -addext keyUsage=critical,keyCertSign,cRLSign -keyout ca.key -out ca.pem
 openssl req -new -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -subj "/CN=$name" -keyout server.key -out server.csr

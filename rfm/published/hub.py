@@ -4,14 +4,19 @@
 from __future__ import annotations
 
 import logging
+import math
+import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import TypeVar
 
+from safetensors import SafetensorError, safe_open
+
 from rfm.files import (
+    ADAPTER_CONFIG,
     ADAPTER_WEIGHTS,
     HUB_FILES,
     HUB_WEIGHTS,
@@ -21,12 +26,15 @@ from rfm.files import (
     CheckpointError,
     cut,
     is_there,
+    network_config,
+    read_json,
+    read_run_config,
     settings_digest,
     shown,
     weights_digest,
 )
 from rfm.published.provenance import snapshot_of
-from rfm.published.run_config import find_run_config
+from rfm.published.run_config import find_run_config, section_of
 from rfm.published.weights import refuse_pickles
 from rfm_client.contract.hub_access import HubError, hub_errors, unreachable
 
@@ -35,6 +43,8 @@ _SOURCE = "a folder that exists or a Hugging Face id org/name[/subfolder][@tag]"
 _ID = re.compile(r"(?P<repo>\w[\w.-]*/\w[\w.-]*)(?:/(?P<subfolder>[\w=.+-]+(?:/[\w=.+-]+)*))?(?:@(?P<tag>.+))?")
 _COMMIT = re.compile(r"[0-9a-f]+")
 _T = TypeVar("_T")
+_FLOAT32_BYTES = 4
+_BASES = ("base_model_id", "base_model_name_or_path", "vlm_name")  # keys that name a base model
 _BEST_TAG = re.compile(r"best-.*?-(-?\d+\.\d+)-step-\d+")
 
 
@@ -42,14 +52,17 @@ _BEST_TAG = re.compile(r"best-.*?-(-?\d+\.\d+)-step-\d+")
 class Found:
     """A checkpoint's files before they are fetched.
 
-    identity: what changes whenever the checkpoint does: commits on the Hub, digests of a local folder's files
+    identity: what changes whenever the checkpoint does: commits on the Hub, digests of a local folder's files; digests
+        of a local base model that its settings name
     sizes: bytes of the files in the checkpoint's folder, by name
     missing_bytes: what ``find`` will download
+    float32_bytes: bytes of the weights in float32, of which most networks load half; None: unknown
     """
 
     identity: tuple[str | None, ...]
     sizes: Mapping[str, int]
     missing_bytes: int = 0
+    float32_bytes: int | None = 0
 
     @property
     def weights_bytes(self) -> int:
@@ -80,7 +93,7 @@ def look(source: str | Path, say: Callable[[str], object] = _log.warning) -> Fou
     run_config = find_run_config(folder)
     run = "" if run_config is None else run_config.read_text(errors="replace")
     sizes = {file.name: file.stat().st_size for file in folder.iterdir() if file.is_file()}
-    return Found((*digests(folder), run), sizes)
+    return Found((*digests(folder), run, *_of_bases(folder)), sizes, float32_bytes=_float32_bytes(folder))
 
 
 def digests(folder: Path) -> tuple[str, str]:
@@ -90,12 +103,36 @@ def digests(folder: Path) -> tuple[str, str]:
     return weights_digest([folder]), settings_digest([folder], {})
 
 
+def _of_bases(folder: Path) -> Iterator[str]:
+    """Yield digests of each local folder that a checkpoint's settings name as base model. Raises CheckpointError."""
+    run_config, adapter = find_run_config(folder), folder / ADAPTER_CONFIG
+    run = {} if run_config is None else section_of(read_run_config(run_config), "model")
+    for settings in (run, read_json(adapter) if is_there(adapter) else {}, network_config(folder)):
+        for value in map(settings.get, _BASES):
+            base = os.path.expanduser(value) if isinstance(value, str) else ""  # noqa: PTH111  untrusted text:
+            if os.path.isdir(base):  # noqa: PTH112  pathlib raises errors for some
+                yield from digests(Path(base))
+
+
+def _float32_bytes(folder: Path) -> int | None:
+    """Return ``Found.float32_bytes``; None for a damaged file, which an export reports."""
+    shapes: list[list[int]] = []
+    try:
+        for file in folder.glob(HUB_WEIGHTS):
+            with safe_open(file, "numpy") as tensors:
+                parts = [tensors.get_slice(name) for name in tensors.keys()]  # noqa: SIM118
+                shapes += [part.get_shape() for part in parts if part.get_dtype() == "F32"]
+    except (OSError, SafetensorError):
+        return None
+    return sum(_FLOAT32_BYTES * math.prod(shape) for shape in shapes)
+
+
 def missing_bytes(repo_id: str, patterns: Sequence[str], revision: str | None = None) -> int:
     """Return what a download of a revision's files will take; 0 without an answer from the Hub. Raises HubError."""
     if unreachable(repo_id, revision=revision) is not None:
         return 0
     with hub_errors():
-        commit, sizes = _sizes(repo_id, patterns, revision)
+        commit, sizes, _ = _sizes(repo_id, patterns, revision)
     return _missing(repo_id, commit, sizes)
 
 
@@ -207,27 +244,36 @@ def _look(repo_id: str, subfolder: str, tag: str | None, *, is_down: bool) -> Fo
     from huggingface_hub import HfApi, snapshot_download
 
     patterns, run_configs = _wanted(subfolder)
+    missing, float32 = 0, None
     if is_down:
         snapshot = Path(snapshot_download(repo_id, revision=tag, local_files_only=True))
         files = [file for file in snapshot.rglob("*") if file.is_file()]
         commit, sizes = snapshot.name, {str(file.relative_to(snapshot)): file.stat().st_size for file in files}
     else:
-        commit, sizes = _sizes(repo_id, patterns, tag)
+        commit, sizes, float32 = _sizes(repo_id, patterns, tag)
+        missing = _missing(repo_id, commit, sizes)
     run_commit = None
     if sizes.keys().isdisjoint(run_configs):  # then main has it
         cached = _snapshots(repo_id).get("main")
         run_commit = HfApi().model_info(repo_id).sha if not is_down else None if cached is None else cached.name
     of_folder = {Path(name).name: size for name, size in sizes.items() if Path(name).parent == Path(subfolder)}
-    return Found((commit, run_commit), of_folder, 0 if is_down else _missing(repo_id, commit, sizes))
+    folder = _home(repo_id) / "snapshots" / commit / subfolder
+    if not missing:
+        return Found((commit, run_commit, *_of_bases(folder)), of_folder, float32_bytes=_float32_bytes(folder))
+    return Found((commit, run_commit), of_folder, missing, None if subfolder else float32)
 
 
-def _sizes(repo_id: str, patterns: Sequence[str], revision: str | None = None) -> tuple[str, dict[str, int]]:
-    """Return a revision's commit, and the size of each file that fits a pattern."""
+def _sizes(
+    repo_id: str, patterns: Sequence[str], revision: str | None = None
+) -> tuple[str, dict[str, int], int | None]:
+    """Return a revision's commit, the size of each file that fits a pattern, and its root's ``Found.float32_bytes``."""
     from huggingface_hub import HfApi
 
     info = HfApi().model_info(repo_id, revision=revision, files_metadata=True)
     sizes = {file.rfilename: file.size or 0 for file in info.siblings or ()}
-    return str(info.sha), {name: size for name, size in sizes.items() if any(fnmatch(name, each) for each in patterns)}
+    float32 = None if info.safetensors is None else _FLOAT32_BYTES * info.safetensors.parameters.get("F32", 0)
+    wanted = {name: size for name, size in sizes.items() if any(fnmatch(name, each) for each in patterns)}
+    return str(info.sha), wanted, float32
 
 
 def _missing(repo_id: str, commit: str, sizes: Mapping[str, int]) -> int:
@@ -238,11 +284,16 @@ def _missing(repo_id: str, commit: str, sizes: Mapping[str, int]) -> int:
     return sum(size for name, size in sizes.items() if name not in cached)
 
 
-def _snapshots(repo_id: str) -> dict[str, Path]:
-    """Return the folders of a repository's revisions in the Hub's cache, by tag or branch."""
+def _home(repo_id: str) -> Path:
+    """Return the folder of a repository in the Hub's cache."""
     from huggingface_hub.constants import HF_HUB_CACHE
 
-    home = Path(HF_HUB_CACHE) / f"models--{repo_id.replace('/', '--')}"
+    return Path(HF_HUB_CACHE) / f"models--{repo_id.replace('/', '--')}"
+
+
+def _snapshots(repo_id: str) -> dict[str, Path]:
+    """Return the folders of a repository's revisions in the Hub's cache, by tag or branch."""
+    home = _home(repo_id)
     refs = [file for file in sorted((home / "refs").rglob("*")) if file.is_file()]
     commits = {str(file.relative_to(home / "refs")): file.read_text().strip() for file in refs}
     return {name: home / "snapshots" / commit for name, commit in commits.items() if _COMMIT.fullmatch(commit)}

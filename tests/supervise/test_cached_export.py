@@ -13,17 +13,22 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any
 
 import psutil
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
+import goldens
 import local_hub
 import rfm_export
 from commands import RFM, nothing_left_behind
 from paths import ROOT
 from rfm.config import ExportConfig
 from rfm.files import CheckpointError
+from rfm.published import hub
 from rfm.published.hub import Found
 from rfm_client import RewardClient
 from rfm_commands.cached_export import find_or_export, is_checkpoint
@@ -147,6 +152,55 @@ def test_a_better_tag_of_the_hub_gives_another_export_and_without_the_hub_the_ca
     assert exports(cache) == {first, second}
 
 
+@pytest.mark.parametrize(("when", "begun"), [("rfm_commands.forecast.needs", 1), ("rfm_export.export", 2)])
+def test_a_better_tag_that_comes_meanwhile_is_exported_instead(
+    files: Path,
+    settings: ExportConfig,
+    cache: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    when: str,
+    begun: int,
+) -> None:
+    """when: the step in which a training run pushes it"""
+    revisions = {"main": files / "checkpoint", "best-p-0.5-step-1": files / "checkpoint"}
+    step = resolve_name(when)
+
+    def pushed(*arguments: Any, **options: Any) -> Any:
+        revisions["best-p-0.7-step-2"] = files / "checkpoint"
+        return step(*arguments, **options)
+
+    monkeypatch.setattr(when, pushed)
+    with local_hub.hub({"org/mine": revisions}) as endpoint, local_hub.asked(endpoint, files / "hub"):
+        repository = find_or_export(replace(settings, checkpoint="org/mine"), cache)
+    assert capsys.readouterr().err.count(BEGINS) == begun
+    assert exports(cache) == {repository}
+    assert local_hub.commit_of("best-p-0.7-step-2") in (repository / "rfm_frames" / "config.pbtxt").read_text()
+
+
+@pytest.mark.parametrize("source", ["folder", "org/adapter"])
+def test_a_changed_base_model_that_an_adapter_names_gives_another_export(
+    tmp_path: Path, cache: Path, source: str
+) -> None:
+    """Where the run trained, its config.yaml names a folder."""
+    golden = goldens.config("q25_peft_adapter_disc10")
+    adapter = shutil.copytree(golden.checkpoint, tmp_path / "adapter")
+    base = shutil.copytree(str(golden.base_model), tmp_path / "Qwen2.5-VL-3B-Instruct", copy_function=shutil.copyfile)
+    run = (adapter / "config.yaml").read_text()
+    (adapter / "config.yaml").write_text(re.sub("base_model_id: .*", f"base_model_id: {base}", run))
+    settings = ExportConfig(checkpoint=str(adapter) if source == "folder" else source, num_gpus=0)
+    with local_hub.hub({"org/adapter": {"main": adapter}}) as endpoint, local_hub.asked(endpoint, tmp_path / "hub"):
+        first = find_or_export(settings, cache)
+        assert find_or_export(settings, cache) == first
+        (weights,) = base.glob("*.safetensors")
+        tensors = load_file(weights)
+        name = next(name for name, tensor in tensors.items() if tensor.ndim == 2)
+        save_file(tensors | {name: tensors[name] + 0.5}, weights, {"format": "pt"})
+        second = find_or_export(settings, cache)
+    assert exports(cache) == {first, second}
+    assert first != second
+
+
 @pytest.fixture
 def large(tmp_path: Path) -> Iterator[tuple[str, Path]]:
     """A Hub with 8.9 GB of weights, which nobody may download, and its cache."""
@@ -155,7 +209,11 @@ def large(tmp_path: Path) -> Iterator[tuple[str, Path]]:
         with (folder / f"model-0000{number}-of-00002.safetensors").open("wb") as file:
             file.truncate(size)
     (folder / "config.json").write_text("{}")
-    with local_hub.hub({"org/Large-4B": {"main": folder}}) as endpoint, local_hub.asked(endpoint, tmp_path / "hub"):
+    repositories, parameters = {"org/Large-4B": {"main": folder}}, {"BF16": 4_450_000_000}
+    with (
+        local_hub.hub(repositories, parameters=parameters) as endpoint,
+        local_hub.asked(endpoint, tmp_path / "hub"),
+    ):
         yield "org/Large-4B", tmp_path / "hub"
 
 
@@ -212,6 +270,31 @@ def test_a_plain_lack_of_room_is_refused_with_a_remedy(
             faults.append(str(error))
     assert len(faults) == bool(message), faults
     assert not message or re.match(message, faults[0]), faults
+
+
+@pytest.mark.parametrize(("float32_bytes", "needed"), [(0, 8.9 * GB), (4 * GB, 6.9 * GB), (None, 0)])
+def test_float32_counts_half_and_weights_of_an_unknown_type_are_not_refused(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, float32_bytes: int | None, needed: float
+) -> None:
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (8 * GB, 8 * GB))
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "NVIDIA H200")
+    *_, of_host, of_gpu = needs(replace(LARGE, float32_bytes=float32_bytes), ExportConfig(), 1, cache)
+    assert of_gpu.needed == needed
+    assert bool(of_host.needed) == bool(needed)
+
+
+@pytest.mark.parametrize(("parameters", "float32_bytes"), [({"F32": 2, "BF16": 5}, 8), (None, None)])
+def test_the_hub_and_the_files_tell_the_weights_type(
+    files: Path, parameters: dict[str, int] | None, float32_bytes: int | None
+) -> None:
+    revisions = {"org/mine": {"main": files / "checkpoint"}}
+    with local_hub.hub(revisions, parameters=parameters) as endpoint, local_hub.asked(endpoint, files / "hub"):
+        assert hub.look("org/mine").float32_bytes == float32_bytes
+        local = hub.find("org/mine")
+        tensors = load_file(local / "model.safetensors").values()
+        counted = sum(tensor.nbytes for tensor in tensors if tensor.dtype == torch.float32)
+        assert counted
+        assert hub.look("org/mine").float32_bytes == hub.look(local).float32_bytes == counted
 
 
 @pytest.mark.triton

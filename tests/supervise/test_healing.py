@@ -120,6 +120,10 @@ def test_a_killed_server_without_a_log_leaves_nothing_running_and_the_next_remov
         wait_for(lambda: served.restarts(MODEL, "triton") == 1)
         served.wait_ready()
         wait_for(gateway)
+        for pid in gateway():
+            os.kill(pid, signal.SIGKILL)
+        wait_for(lambda: served.restarts("gateway") == 1)
+        wait_for(gateway)
         (triton,) = running(f"--http-port={ends.http_port}") - running("--gateway-port")
         (prefix,) = re.findall("shm-region-prefix-name=(.*)", "\n".join(psutil.Process(triton).cmdline()))
         started = {triton, *model(), *gateway(), *running(f"--gateway-port={more.grpc_port}")}

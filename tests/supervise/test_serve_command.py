@@ -204,6 +204,7 @@ WRONG_FOLDERS: dict[str, tuple[str, str]] = {  # below a folder
     "a served checkpoint": ("models/rfm/1/checkpoint", "a folder inside one: --repository {root}/models"),
     "one above": ("", "a folder that has one: --repository {root}/models"),
     "a checkpoint": ("checkpoint", "a checkpoint: rfm serve {folder} exports and serves it"),
+    "a part": ("part", "which has none: rfm export --checkpoint CHECKPOINT --repository {folder} writes them"),
 }
 
 
@@ -211,6 +212,8 @@ WRONG_FOLDERS: dict[str, tuple[str, str]] = {  # below a folder
 def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("folders")
     (root / "empty").mkdir()
+    (root / "part").mkdir()
+    (root / "part/model.safetensors.part").touch()
     shutil.copytree(REPOSITORY, root / "models")
     shutil.copy(root / "models/rfm/config.pbtxt", root / "models/rfm/1")  # as an export leaves it
     shutil.copytree(REPOSITORY / "rfm/1/checkpoint", root / "checkpoint")

@@ -21,10 +21,13 @@ def commit_of(revision: str) -> str:
 
 
 @contextmanager
-def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") -> Iterator[str]:
+def hub(
+    repositories: Mapping[str, Mapping[str, Path]], kind: str = "models", parameters: Mapping[str, int] | None = None
+) -> Iterator[str]:
     """Serve repositories by id (``org/name``) with a folder per revision. Yields the endpoint.
 
     kind: ``models`` or ``datasets``. All revisions but main are tags
+    parameters: what the Hub says about weights, by their type
     """
 
     class Handler(Quiet, BaseHTTPRequestHandler):
@@ -55,6 +58,8 @@ def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") ->
                 named = {str(file.relative_to(folder)): file for file in sorted(folder.rglob("*")) if file.is_file()}
                 siblings = [{"rfilename": name, "size": file.stat().st_size} for name, file in named.items()]
                 told = {"id": repository, "sha": _commit(revisions, revision), "siblings": siblings}
+                if parameters is not None:
+                    told["safetensors"] = {"parameters": parameters, "total": sum(parameters.values())}
                 self._send(200, json.dumps(told).encode())
             elif self.path.startswith(f"{api}/tree/"):
                 revision = self.path.removeprefix(f"{api}/tree/")
