@@ -31,7 +31,6 @@ SHARDS = "model-*.safetensors"
 NETWORK_CONFIG = "config.json"
 ADAPTER_CONFIG = "adapter_config.json"
 ADAPTER_WEIGHTS = "adapter_model.safetensors"
-CHECKPOINT_FILES = (WEIGHTS, WEIGHTS_INDEX, NETWORK_CONFIG, ADAPTER_CONFIG)  # a folder with one is a checkpoint
 RUN_CONFIG = "config.yaml"
 RUN_CONFIGS = (RUN_CONFIG, "config.yml", ".hydra/config.yaml")  # the first that exists is read
 PREPROCESSOR_CONFIG = "preprocessor_config.json"  # image preprocessing, beside a model's weights

@@ -22,10 +22,9 @@ from typing import TYPE_CHECKING
 import typer
 
 from rfm.config import ExportConfig
-from rfm.files import CHECKPOINT_FILES
 from rfm.parameters import EXPORT_VERSION
 from rfm.serve.processes import ProcessGroup, how_it_ended
-from rfm.serve.repository import CONFIG_FILE, models_in
+from rfm.serve.repository import CHECKPOINT_FILES, CONFIG_FILE, models_in
 from rfm.serve.triton_server import stopped_by_signals
 from rfm_commands.command import RfmCommand, fail, say, timed_steps
 

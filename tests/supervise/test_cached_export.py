@@ -30,6 +30,7 @@ from rfm.config import ExportConfig
 from rfm.files import CheckpointError
 from rfm.published import hub
 from rfm.published.hub import Found
+from rfm.published.rewind import TEXT_ENCODER
 from rfm_client import RewardClient
 from rfm_commands.cached_export import find_or_export, is_checkpoint
 from rfm_commands.forecast import needs
@@ -74,9 +75,17 @@ def test_only_a_checkpoint_is_taken_for_one(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_an_export_is_kept_until_something_that_decides_it_changes(
-    files: Path, settings: ExportConfig, cache: Path, capsys: pytest.CaptureFixture[str]
+    files: Path,
+    settings: ExportConfig,
+    cache: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    for file in ("", "checkpoint/config.json", "image_encoder/config.json"):
+    """The text encoder is the default, of which a folder lies here."""
+    shutil.move(files / "text_encoder", files / TEXT_ENCODER)
+    monkeypatch.chdir(files)
+    settings = replace(settings, text_encoder=None)
+    for file in ("", "checkpoint/config.json", "image_encoder/config.json", f"{TEXT_ENCODER}/config.json"):
         if file:
             changed = json.loads((files / file).read_text()) | {"license": "mit"}
             (files / file).write_text(json.dumps(changed))
@@ -85,7 +94,7 @@ def test_an_export_is_kept_until_something_that_decides_it_changes(
             assert BEGINS in capsys.readouterr().err
             assert find_or_export(asked, cache) == repository
             assert capsys.readouterr().err == f"rfm: {asked.checkpoint}: served from its export {repository}\n"
-    assert len(exports(cache)) == 6
+    assert len(exports(cache)) == 8
 
 
 def test_a_pipe_in_the_place_of_weights_is_refused(files: Path, settings: ExportConfig, cache: Path) -> None:
