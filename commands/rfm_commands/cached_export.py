@@ -15,7 +15,6 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from contextlib import redirect_stdout
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     from rfm.published.hub import Found
 
 CACHE = Path(".cache")  # in the home folder, as the XDG base directory specification says
+NOTES = "notes.txt"  # what the export told the user, beside its repository
 DIGEST_DIGITS = 12
 
 
@@ -73,7 +73,7 @@ def cache_folder(environment: Mapping[str, str]) -> Path:
 def find_or_export(settings: ExportConfig, folder: Path) -> Path:
     """Return the repository in ``folder`` that these settings have, exported if it is missing.
 
-    Writes lines for the user: which export it is; before a new one, what it takes.
+    Writes lines for the user: before a new export, what it takes; what an export told; which one it is.
     Raises CheckpointError, ExportError.
     """
     import rfm_export
@@ -83,13 +83,19 @@ def find_or_export(settings: ExportConfig, folder: Path) -> Path:
     from rfm_export.source import check_gpus, num_gpus
 
     check_gpus(settings.num_gpus)
-    source, tell = str(settings.checkpoint), cache(say)  # cache: each line once
+    source, told = str(settings.checkpoint), dict[str, None]()
+
+    def tell(line: str) -> None:
+        if line not in told:
+            told[line] = None
+            say(line)
+
     with timed_steps() as begin:
         found, gpus = hub.look(source, tell), num_gpus(settings)
         name = Path(source).expanduser().absolute().name.partition("@")[0]
         digest = _digest(source, found, settings, gpus)
         home = folder / f"{name}-{digest}"
-        repository = home / "models"
+        repository, notes = home / "models", home / NOTES
 
         def is_same() -> bool:
             return _digest(source, hub.look(source, tell), settings, gpus) == digest
@@ -107,12 +113,16 @@ def find_or_export(settings: ExportConfig, folder: Path) -> Path:
                         begin("downloading")
                         hub.find(source, tell)
                     if not found.missing_bytes or is_same():
+                        num_before = len(told)
                         rfm_export.export(source, scratch / "models", settings, say=tell, begin=begin)
                         if is_same():
+                            notes.write_text("".join(f"{line}\n" for line in [*told][num_before:]))
                             (scratch / "models").rename(repository)
     if not repository.exists():  # a better tag came, or the new files name a folder of this machine
         say(f"{source}: other files decide its export now: looking again")
         return find_or_export(settings, folder)
+    for line in notes.read_text().splitlines() if notes.exists() else ():  # older exports have none
+        tell(line)
     say(f"{source}: served from its export {repository}")
     return repository
 

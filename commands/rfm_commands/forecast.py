@@ -60,7 +60,7 @@ def needs(found: Found, settings: ExportConfig, num_gpus: int, cache: Path) -> I
         rate = f"{DOWNLOAD_BYTES_PER_S / _MB:.0f} MB/s"
         yield Need(f"download: {size(download)}, {_duration(seconds)} at {rate}")
     else:
-        yield Need("download: nothing, all files are here")
+        yield Need("download: nothing for the checkpoint itself")
     if found.is_adapter:
         yield Need("memory, disk: those of the adapter's base model")
         return

@@ -11,7 +11,7 @@ from typing import Any
 from google.protobuf import json_format, text_format
 from tritonclient.grpc.model_config_pb2 import ModelConfig
 
-from rfm.parameters import EXPORT_PARAMETER, EXPORT_VERSION, PYTHON_PARAMETERS
+from rfm.parameters import CHECKPOINT_FOLDER, EXPORT_PARAMETER, EXPORT_VERSION, PYTHON_PARAMETERS
 from rfm.serve.installation import ServerStartError
 from rfm_client.contract.description import DESCRIPTION_PARAMETER, Description
 
@@ -54,6 +54,10 @@ def _found(folder: Path) -> tuple[str, str]:
     below = next((file.parent.parent for file in sorted(folder.glob(f"*/*/{CONFIG_FILE}"))), None)
     if below is not None:
         return "a folder that has one", f"--repository {below}"
+    if any((inner := folder / CHECKPOINT_FOLDER).glob(_WEIGHTS)):
+        there = [name for name in ("image_encoder", "text_encoder") if (folder / name).is_dir()]
+        options = "".join(f" --{name.replace('_', '-')} {folder / name}" for name in there)
+        return "a folder that holds a checkpoint", f"rfm serve {inner}{options} exports and serves it"
     return "which has none", f"{new} writes them"
 
 

@@ -7,6 +7,7 @@ import gc
 import json
 import logging
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -38,6 +39,11 @@ logger = logging.getLogger(__name__)
 Question = TypeVar("Question")
 Answer = TypeVar("Answer")
 Scored: TypeAlias = list[tuple[Sequence[Request[Question]], Execution]]  # requests, and the cost of scoring them
+
+
+def _decisive(computation: str, placement: Placement) -> str:
+    """Return what decides scores of a computation: on a CPU not PyTorch's build, for example +cpu or +cu130."""
+    return re.sub(r"\+\w+", "", computation) if placement.device.type == "cpu" else computation
 
 
 class BatchModel(Generic[Question, Answer]):
@@ -77,7 +83,7 @@ class BatchModel(Generic[Question, Answer]):
         self._blank_tensors = probe_request(config)
         self._num_warmups = sum(warmup.get("count") or 1 for warmup in config.get("model_warmup", []))
         exported = description.computation
-        if exported and TORCH not in exported.split(", "):
+        if exported and _decisive(TORCH, placement) not in _decisive(exported, placement).split(", "):
             differs = "labels will name the export's computation, %s, but this is %s: export with %s"
             logger.warning(differs, exported, TORCH, TORCH)
         if self.works_ahead:

@@ -90,8 +90,8 @@ for datasets in ((), ("demonstrations",)):
 def test_without_rfm_labels_the_page_shows_no_datasets_and_names_the_package_to_install() -> None:
     done = subprocess.run([sys.executable, "-c", WITHOUT_LABELS], capture_output=True, text=True, check=False)
     assert done.stdout == "shows\n"
-    assert "dataset: expected the package rfm_labels" in done.stderr
-    assert done.stderr.endswith(", which reads it, got none: pip install ./apps/labels\n")
+    assert "dataset: expected packages that read it, got import of rfm_labels halted" in done.stderr
+    assert done.stderr.endswith(": pip install ./client ./apps/labels\n")
 
 
 @pytest.mark.parametrize("folder", [*(ROOT / "apps").glob("*/*/vendored/*"), *Path(__file__).parent.glob("vendored/*")])

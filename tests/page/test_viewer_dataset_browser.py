@@ -244,6 +244,7 @@ def test_selected_episodes_are_taken_along(page: Page) -> None:
     last = float(columns_of(page.folders[DEMO], 7)["success"][-1])
     assert saved["episodes"][1]["last_success"] == pytest.approx(last)
     assert page.browser["use-words"].text == '--dataset.episodes="[2, 7]"'
+    assert page.browser["use-told"].text == ""
     others = [each.index for each in dataset.episodes if each.index not in (2, 7)]
     for use, target, away in (("delete", "toy_v30_many_cleaned", [2, 7]), ("keep", "toy_v30_many_kept", others)):
         Select(page.browser["use"]).select_by_value(use)
@@ -257,10 +258,15 @@ def test_selected_episodes_are_taken_along(page: Page) -> None:
     page.browser["choose-shown"].click()
     green = [each.index for each in dataset.episodes if "green" in each.task]
     assert page.browser["chosen-told"].text == f"{len(green)} episodes selected"
+    page.browser["choose-none"].click()
+    tick(page, "never")
+    Select(page.browser["use"]).select_by_value("train")
+    assert page.browser["use-told"].text == "All of them never succeed."
 
 
 def test_two_label_files_are_overlaid_and_their_differences_listed(page: Page) -> None:
     page.choose(DEMO)
+    assert [each.text for each in Select(page.browser["others"]).options] == ["none", f"{OTHER}_progress.parquet"]
     Select(page.browser["others"]).select_by_visible_text(f"{OTHER}_progress.parquet")
     page.browser.until("document.getElementById('filter-differ').hidden === false")
     ours, theirs = (summarise(page.folders[DEMO] / f"{name}_progress.parquet") for name in ("rfm", OTHER))
@@ -413,9 +419,38 @@ def test_an_episode_is_scored_as_it_was_for_the_labels_and_one_without_labels_to
     page.open()
     page.choose(PLAIN)
     assert [row[4:] for row in page.rows] == [["-"] * 6] * 8
+    assert page.browser["count-never"].text == "-"
+    assert page.browser["no-labels"].text.splitlines()[-2:] == ["rfm-client label toy_v21", "Copy"]
     page.at_rest(1)
     assert page.numbers == []
     page.score_episode()
+    page.browser["dataset-tab"].click()
+    page.browser["score-episode"].click()
+    question = page.browser.driver.switch_to.alert
+    assert question.text == "Replace the 2 videos on the Score tab?"
+    question.dismiss()
+    assert page.browser["dataset-panel"].is_displayed()
+    page.browser["score-episode"].click()
+    page.browser.driver.switch_to.alert.accept()
+    page.browser.until_text("scored", "2 of 2 scored")
+
+
+def test_clear_restores_the_settings_before_an_episode_and_undo_those_of_the_episode(page: Page) -> None:
+    def settings() -> list[str | None]:
+        return [page.browser[name].get_attribute("value") for name in ("fps", "orient", "channels")]
+
+    before = settings()
+    dataset = page.choose(BRIGHT)
+    page.at_rest(1)
+    page.score_episode()
+    of_episode = settings()
+    assert of_episode == [f"{dataset.fps:g}", "none", "rgb"] != before
+    page.browser["clear"].click()
+    assert settings() == before
+    page.browser["undo"].click()
+    assert settings() == of_episode
+    page.browser["clear"].click()
+    assert settings() == before
 
 
 def test_an_episode_of_a_folder_of_videos_is_scored_as_it_was_for_the_labels(page: Page) -> None:

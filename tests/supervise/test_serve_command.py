@@ -203,6 +203,11 @@ WRONG_FOLDERS: dict[str, tuple[str, str]] = {  # below a folder
     "a model": ("models/rfm", "a folder inside one: --repository {root}/models"),
     "a served checkpoint": ("models/rfm/1/checkpoint", "a folder inside one: --repository {root}/models"),
     "one above": ("", "a folder that has one: --repository {root}/models"),
+    "a training's folder": (
+        "trained",
+        "a folder that holds a checkpoint: rfm serve {folder}/checkpoint --image-encoder {folder}/image_encoder "
+        "exports and serves it",
+    ),
     "a checkpoint": ("checkpoint", "a checkpoint: rfm serve {folder} exports and serves it"),
     "a part": ("part", "which has none: rfm export --checkpoint CHECKPOINT --repository {folder} writes them"),
 }
@@ -216,7 +221,9 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (root / "part/model.safetensors.part").touch()
     shutil.copytree(REPOSITORY, root / "models")
     shutil.copy(root / "models/rfm/config.pbtxt", root / "models/rfm/1")  # as an export leaves it
-    shutil.copytree(REPOSITORY / "rfm/1/checkpoint", root / "checkpoint")
+    for folder in ("checkpoint", "trained/checkpoint"):
+        shutil.copytree(REPOSITORY / "rfm/1/checkpoint", root / folder)
+    (root / "trained/image_encoder").mkdir()
     return root
 
 

@@ -309,7 +309,12 @@ def test_requests_are_scored_in_the_thread_that_calls_execute_and_the_watchdog_k
     assert threads == [threading.current_thread()] * 2
 
 
-@pytest.mark.parametrize("told", ["", f"float32, torch {torch.__version__}, sdpa", "float32, torch 1.0, sdpa"])
+RELEASE = torch.__version__.partition("+")[0]
+
+
+@pytest.mark.parametrize(
+    "told", ["", f"torch {torch.__version__}, sdpa", f"torch {RELEASE}+cu0, sdpa", "torch 1.0, sdpa"]
+)
 def test_an_instance_notes_that_labels_name_another_pytorch(tmp_path: Path, told: str) -> None:
     """Clients read the PyTorch of the export, and write it into label files."""
     Model(tmp_path, description=Description(computation=told))

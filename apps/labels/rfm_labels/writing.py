@@ -82,7 +82,7 @@ class Parts:
             from fsspec.core import url_to_fs
             from fsspec.implementations.local import LocalFileSystem
         except ImportError as error:
-            raise ImportError("labelling needs pyarrow and fsspec: pip install ./client ./apps/labels") from error
+            raise ImportError(f"labelling: {error}: pip install ./client ./apps/labels") from error
         self.url = url
         self._fs, self._root = url_to_fs(url)
         self._is_local = isinstance(self._fs, LocalFileSystem)

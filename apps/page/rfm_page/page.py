@@ -49,9 +49,10 @@ def shown_datasets(config: GatewayConfig) -> list[ShownDataset]:
         from rfm_labels.datasets import Hdf5Dataset, LeRobotDataset, open_to_show
         from rfm_page.datasets import ShownHdf5, ShownLeRobot
         from rfm_page.shown import ShownDataset
-    except ModuleNotFoundError as error:
-        expected = f"the package {error.name}, which reads it"
-        raise ConfigError.at("dataset", expected, "none: pip install ./apps/labels") from None
+    except ImportError as error:
+        raise ConfigError.at(
+            "dataset", "packages that read it", f"{error}: pip install ./client ./apps/labels"
+        ) from None
     datasets: list[ShownDataset] = []
     try:
         for dataset in chain.from_iterable(map(open_to_show, config.dataset)):

@@ -29,7 +29,7 @@ def opened_hdf5(file: Path) -> Iterator[Any]:
     try:
         import h5py
     except ImportError as error:
-        raise ImportError('HDF5 files need h5py: pip install ./client "./apps/labels[hdf5]"') from error
+        raise ImportError(f'HDF5 files need h5py: {error}: pip install ./client "./apps/labels[hdf5]"') from error
     if file.exists() and not file.is_file():  # opening a pipe would block for ever
         raise DatasetError.at(file, "an HDF5 file", "a folder, a pipe, a socket or a device")
     try:

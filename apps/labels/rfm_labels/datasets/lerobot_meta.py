@@ -171,7 +171,7 @@ def read_table(file: Path, columns: list[str] | None = None, filters: Any = None
         import pyarrow
         from pyarrow import parquet
     except ImportError as error:
-        raise ImportError("LeRobot datasets need pyarrow: pip install ./client ./apps/labels") from error
+        raise ImportError(f"LeRobot datasets need pyarrow: {error}: pip install ./client ./apps/labels") from error
     try:
         table = parquet.read_table(file, columns=columns, filters=filters, partitioning=None)
     except FileNotFoundError as error:

@@ -4,7 +4,7 @@
 import { curvesOf, datasets, episodesOf, faultsOf, missingOf, previewOf, videoOf } from "./api.js";
 import { Asking } from "./asking.js";
 import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, toldOf, UNDONE, WORST_FIRST } from "./episodes.js";
-import { deadLink, downloading, failure, noDataset, noEpisode, noHit, noVideo } from "./faults.js";
+import { deadLink, downloading, failure, noDataset, noEpisode, noHit, noLabels, noVideo } from "./faults.js";
 import { episodesJson, episodesText, lerobotWords } from "./exports.js";
 import { Histogram } from "./histogram.js";
 import { onKeys } from "./keys.js";
@@ -12,7 +12,7 @@ import { DASHES, lookOf, namedLine } from "./looks.js";
 import { Previews } from "./previews.js";
 import { Place } from "./states.js";
 import { save } from "./takeaway.js";
-import { cut, shown } from "./text.js";
+import { cut, NONE, shown } from "./text.js";
 import { Timeline } from "./timeline.js";
 
 const CAMERA_PREFIX = "observation.images.";
@@ -60,7 +60,7 @@ export class DatasetTab {
     this.#onShown = onShown;
     this.#onScore = onScore;
     this.#failedAnywhere = failedAnywhere;
-    const places = { none: "no-datasets", errors: "dataset-errors", hits: "no-hits", episode: "episode-errors" };
+    const places = { none: "no-datasets", errors: "dataset-errors", hits: "no-hits", labels: "no-labels", episode: "episode-errors" };
     this.#places = Object.fromEntries(Object.entries(places).map(([name, id]) => [name, new Place(page[id])]));
     this.#histogram = new Histogram(page.histogram);
     const rows = { scroller: page["episode-list"], body: page.episodes, above: page["episodes-above"], below: page["episodes-below"] };
@@ -233,23 +233,24 @@ export class DatasetTab {
   }
 
   get #usualOrder() {
-    return this.#told.episodes.some(({ final_progress: final }) => final !== undefined) ? WORST_FIRST : PLAIN_ORDER;
+    return this.#isLabelled ? WORST_FIRST : PLAIN_ORDER;
+  }
+
+  get #isLabelled() {
+    return this.#told.episodes.some(({ final_progress: final }) => final !== undefined);
   }
 
   /** Shows a dataset. chosen, beside: the labels; null: the first, none */
   async #choose(number = this.#number, chosen = null, beside = null) {
     this.#page.dataset.value = number;
     const { labels } = this.#datasets[this.#number];
-    const options = (none) => [...(none ? [new Option("none", "")] : []), ...labels.map((name) => new Option(name))];
-    this.#page.labels.replaceChildren(...options(!labels.length));
-    this.#page.others.replaceChildren(...options(true));
+    this.#page.labels.replaceChildren(...(labels.length ? labels.map((name) => new Option(name)) : [new Option("none", "")]));
     if (labels.includes(chosen)) this.#page.labels.value = chosen;
-    if (labels.includes(beside)) this.#page.others.value = beside;
-    await this.#load();
+    await this.#load(beside);
   }
 
-  /** Asks what the chosen labels say. */
-  async #load() {
+  /** Asks what the chosen labels say. beside: other labels, or null */
+  async #load(beside = this.#page.others.value) {
     this.#leave();
     this.#checking.abort();
     this.#loading.abort();
@@ -259,19 +260,21 @@ export class DatasetTab {
     this.#chosen.clear();
     const { signal } = this.#stopping;
     const page = this.#page;
+    const names = this.#datasets[this.#number].labels.filter((name) => name !== this.#labels);
+    page.others.replaceChildren(new Option("none", ""), ...names.map((name) => new Option(name)));
+    if (names.includes(beside)) page.others.value = beside;
     const other = page.others.value;
     try {
       const asked = [episodesOf(this.#number, this.#labels, signal), ...(other ? [episodesOf(this.#number, other, signal)] : [])];
-      const [told, beside] = await Promise.all(asked);
+      const [told, others] = await Promise.all(asked);
       this.#told = told;
-      this.#others = beside ? new Map(beside.episodes.map((row) => [row.episode, row])) : null;
+      this.#others = others ? new Map(others.episodes.map((row) => [row.episode, row])) : null;
     } catch (error) {
       if (signal.aborted) return;
       [this.#told, this.#others] = [NOTHING, null];
       this.#failed("errors", "The dataset cannot be shown", error, () => this.#load());
     }
     this.#previews.begin();
-    const isLabelled = this.#told.episodes.some(({ final_progress: final }) => final !== undefined);
     page.cutoff.value = this.#told.threshold;
     page.order.value = this.#usualOrder;
     this.#isTurned = false;
@@ -279,7 +282,9 @@ export class DatasetTab {
     if (!other) page["only-differ"].checked = false;
     page["episode-list"].classList.toggle("beside", Boolean(other));
     page["episode-list"].classList.toggle("one-camera", this.#told.cameras.length < 2);
-    page.ends.hidden = !isLabelled;
+    page.ends.hidden = !this.#isLabelled;
+    if (this.#isLabelled || !this.#told.episodes.length) this.#places.labels.clear();
+    else this.#places.labels.show(noLabels(this.#datasets[this.#number].name));
     const leftOut = Object.entries(this.#told.left_out).map(([camera, reason]) => `${short(camera)} is left out: ${reason}`);
     page["left-out"].textContent = leftOut.join("; ");
     page["left-out"].hidden = !leftOut.length;
@@ -316,7 +321,7 @@ export class DatasetTab {
 
   #judge() {
     this.#episodes = judged(this.#told.episodes, this.#threshold, this.#others);
-    for (const name of FILTER_NAMES) this.#page[`count-${name}`].textContent = kept(this.#episodes, [this.#filter(name)], "").length;
+    for (const name of FILTER_NAMES) this.#page[`count-${name}`].textContent = this.#isLabelled ? kept(this.#episodes, [this.#filter(name)], "").length : NONE;
     this.#showEnds();
     this.#showTable();
   }
@@ -381,6 +386,8 @@ export class DatasetTab {
     const dataset = this.#datasets[this.#number];
     const all = this.#episodes.map(({ episode }) => episode);
     this.#words = dataset ? lerobotWords(page.use.value, dataset, numbers, all) : "";
+    const areFailures = numbers.length > 0 && this.#taken.every(({ never_succeeds: never }) => never);
+    page["use-told"].textContent = page.use.value === "train" && areFailures ? "All of them never succeed." : "";
     page["use-copy"].disabled = !/^[^#]/m.test(this.#words); // there are only comments
     page["use-words"].textContent = this.#words.split("\n").map((line) => cut(line, MOST_LETTERS)).join("\n");
   }

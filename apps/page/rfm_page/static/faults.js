@@ -2,6 +2,7 @@
 // What the page says of each fault and of each thing that is missing, with the command that mends it.
 
 import { ServerError } from "./api.js";
+import { quoted } from "./shell.js";
 
 const BY_ITSELF = "Checking automatically.";
 let remedies = {}; // command lines of this server, by what is missing
@@ -67,6 +68,15 @@ export function noEpisode(retry) {
     text: "This dataset is empty. Record into it, or restart the server with another one:",
     command: remedies.dataset,
     buttons: [["Check now", retry]],
+  };
+}
+
+export function noLabels(dataset) {
+  return {
+    kind: "empty",
+    title: "No labels",
+    text: "Label this dataset, then reload the page:",
+    command: `rfm-client label ${quoted(dataset)}`,
   };
 }
 

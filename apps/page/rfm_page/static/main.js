@@ -24,6 +24,7 @@ import { learn, toldAt } from "./signals.js";
 import { addVerdict, ofOneFile, sentenceOf } from "./verdicts.js";
 
 const CURVES_AT_A_TIME = 3;
+const OF_EPISODES = ["fps", "orient", "channels"]; // settings that an episode brings
 
 const page = Object.fromEntries([...document.querySelectorAll("[id]")].map((element) => [element.id, element]));
 const queue = new Queue(CURVES_AT_A_TIME);
@@ -43,6 +44,7 @@ const address = new Address(go);
 let shownIndex = 0; // of the tab
 let curves = [];
 let verdicts = [];
+let usual = null; // the values of OF_EPISODES before an episode; null: they are still there
 const gateway = { models: [], rules: [], url: "" };
 let stopping = new AbortController();
 let comparing = null; // ends the comparison on the way
@@ -235,14 +237,24 @@ function askForTask() {
   page.tasks.focus();
 }
 
-/** Scores an episode of a dataset in place of what was there. fps: frames a second; corrections, origins: of each file */
+/** Scores an episode of a dataset in place of what was there, if the user agrees. fps: frames a second; corrections, origins: of each file */
 function scoreEpisode({ files, task, fps, corrections, origins }) {
+  const there = videos.all.length;
+  if (there && !confirm(`Replace the ${there === 1 ? "video" : `${there} videos`} on the Score tab?`)) return;
   clear();
+  usual = valuesOf(OF_EPISODES);
   page.tasks.value = task;
-  page.fps.value = fps;
-  [page.orient.value, page.channels.value] = [corrections[0]?.orient ?? "none", corrections[0]?.channels ?? "rgb"];
+  setValues({ orient: "none", channels: "rgb", ...corrections[0], fps });
   tabs.select(0);
   addFiles(files, files.map((_, index) => ({ corrected: corrections[index], origin: origins[index] })));
+}
+
+function valuesOf(names) {
+  return Object.fromEntries(names.map((name) => [name, page[name].value]));
+}
+
+function setValues(values) {
+  for (const [name, value] of Object.entries(values)) page[name].value = value;
 }
 
 async function scoreExamples(names) {
@@ -300,8 +312,17 @@ function showEnds() {
   if (isOver && !videos.isPlaying) timeline.moveTo(Infinity);
 }
 
+/** The videos that can be compared: all but those whose every curve failed. */
+function comparable() {
+  const isFailed = ({ state, error }) => state === "failed" && error !== "stopped";
+  return videos.all.filter((video) => {
+    const own = curves.filter((curve) => curve.video === video);
+    return !own.length || !own.every(isFailed);
+  });
+}
+
 async function compareAll() {
-  const all = videos.all;
+  const all = comparable();
   const { model, fps, resize } = settings();
   const { orient, channels } = all[0];
   const before = verdicts.length;
@@ -324,6 +345,7 @@ async function compareAll() {
       tell({ videos: all, task, model, fps, orient, channels, resize, answer });
     }
   } catch (error) {
+    error.message = error.message.replace(/\bvideo_(\d+)/g, (field, index) => all[index]?.name ?? field);
     if (!signal.aborted) failed(error, "The videos could not be compared", compareAll);
   }
   comparing = null;
@@ -358,6 +380,8 @@ function clear() {
   verdicts = [];
   page.pairs.replaceChildren();
   places.errors.clear();
+  setValues(usual ?? {});
+  usual = null;
   timeline.moveTo(0);
   update();
 }
@@ -366,12 +390,14 @@ function clear() {
 function clearForNow() {
   stop();
   const gone = { entries: videos.all, curves, verdicts };
-  const text = page.tasks.value;
+  const [text, values, before] = [page.tasks.value, valuesOf(OF_EPISODES), usual];
   clear();
   page.status.textContent = `Cleared ${gone.entries.length} ${gone.entries.length === 1 ? "video" : "videos"}.`;
   page.undo.hidden = false;
   page.undo.onclick = () => {
     page.tasks.value ||= text;
+    setValues(values);
+    usual = before;
     restore(gone);
   };
   page.undo.focus();
@@ -476,9 +502,9 @@ function update() {
   }
   showTable(page.curves, curves, Number(page.threshold.value));
   page.stop.disabled = queue.isIdle && !comparing;
-  page.compare.hidden = videos.all.length < 2 || !page.model.value;
+  page.compare.hidden = comparable().length < 2 || !page.model.value;
   page.compare.disabled = Boolean(comparing);
-  page.compare.textContent = comparing ? `Comparing ${videos.all.length} videos…` : "Compare videos";
+  page.compare.textContent = comparing ? `Comparing ${comparable().length} videos…` : "Compare videos";
   page.take.hidden = !scored.length && !answered().length;
   page.verdicts.hidden = !verdicts.length;
   page.png.disabled = page.svg.disabled = page.csv.disabled = !scored.length;
