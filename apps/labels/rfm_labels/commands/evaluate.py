@@ -91,7 +91,7 @@ def _print_tables(comparison: LabelComparison) -> None:
     for each in comparison.evaluations:
         cells = [each.name, number(each.spearman), number(each.kendall), str(each.num_constant), number(each.final)]
         if known is not None:
-            aurocs = [ranking and ranking.auroc for ranking in (each.by_success, each.by_progress)]
+            aurocs = [None if ranking is None else ranking.auroc for ranking in (each.by_success, each.by_progress)]
             cells += map(number, (each.final_of_successes, each.final_of_failures, *aurocs))
             best = each.by_success
             cells += ["-", "-"] if best is None else [_exact(best.threshold), number(best.balanced_accuracy)]
