@@ -200,6 +200,8 @@ def test_scoring_with_a_model_that_is_not_served_fails_and_names_it(engines: Eng
     result = ask(engines, "score", video, "--task", clip.TASK, model="c1_t1_disc10")  # which reads embeddings alone
     assert result.exit_code == ExitCode.NO_MODEL
     assert "c1_t1_disc10_frames" in result.stderr
+    remedy = "this checkpoint takes embeddings alone: export it with --image-encoder and --text-encoder"
+    assert result.stderr.endswith(f": {remedy}\n")
 
 
 def test_wait_returns_when_the_model_is_ready_or_its_time_is_up(engines: EngineServer) -> None:

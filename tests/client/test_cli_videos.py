@@ -20,6 +20,7 @@ from engine_server import EngineServer
 from rfm_client import (
     FrameScores,
     InferenceFailedError,
+    ModelInfo,
     PreferenceResult,
     ProgressResult,
     RewardClient,
@@ -72,6 +73,7 @@ def test_score_writes_the_client_s_scores_and_one_bad_video_does_not_stop_the_ot
     assert_scores(first, filmed)
     assert_scores(second, embedded)
     assert (first["source"], first["num_frames"], first["model_version"]) == (str(video), 32, "1")
+    assert (first["checkpoint"], first["warning"]) == (MODEL, None)
     assert first["frame_indices"] == EVENLY.tolist()
     np.testing.assert_allclose(first["frame_times_s"], EVENLY / clip.FPS)
     assert second["frame_indices"] == list(range(5))
@@ -122,7 +124,7 @@ def test_score_and_compare_apply_the_options_orient_and_channels(
     first, second = (Trajectory(frames=frames, task=TASK) for frames in (upright, upright[:, ::-1, :, ::-1]))
     with engines.client(MODEL) as client:
         assert_scores(told["videos"][0], client.progress(first))
-        preference = client.preference(first, second).preference
+        preference = client.preference(first, second, both_orders=True).preference
     assert compared["preference"] == pytest.approx(preference, abs=TOLERANCE)
 
 
@@ -171,9 +173,9 @@ def test_compare_of_two_videos_has_their_preference_and_verdict(engines: EngineS
     document = json.loads(result.stdout)
     with engines.client(MODEL) as client:
         expected = client.preference(first, replace(second, text_embedding=None), both_orders=True)
-        once = client.preference(first, second)
         alone = [client.progress(each) for each in (first, replace(second, text_embedding=first.text_embedding))]
-    assert document["preference"] == pytest.approx(once.preference, abs=TOLERANCE)
+    assert document["preference"] == pytest.approx(expected.preference, abs=TOLERANCE)
+    assert document["preference"] == document["pairs"][0]["preference"]
     assert_scores(document["first"], alone[0])
     assert_scores(document["second"], alone[1])
     assert (document["verdict"], document["orders_agree"]) == (expected.verdict, expected.orders_agree)
@@ -278,6 +280,7 @@ def test_a_comparison_names_no_winner_where_the_orders_disagree(
     scores = ProgressResult(progress=np.zeros(2, np.float32), success=np.zeros(2, np.float32))
     seen = random_trajectory(0, 2, *WIDTHS)
     comparison = Comparison(
+        info=ModelInfo(name="rfm", versions=("1",), max_batch_size=64),
         sources=[Source(f"{index}.npz", seen, None) for index in range(len(ranks))],
         scores=[scores] * len(ranks),
         results={

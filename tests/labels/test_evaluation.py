@@ -55,7 +55,7 @@ def test_thresholds_separate_successes_from_failures(tmp_path: Path) -> None:
     assert found.by_success is not None
     assert found.by_progress.auroc == pytest.approx((4 - 0.5) / 4)  # one of four pairs is a tie
     assert (found.by_success.auroc, found.by_success.balanced_accuracy) == (1.0, 1.0)
-    assert found.by_success.threshold == pytest.approx(0.4)
+    assert found.by_success.threshold == 0.35  # in the middle of 0.3 and 0.4
     assert (found.final_of_successes, found.final_of_failures) == (pytest.approx(0.85), pytest.approx(0.45))
 
 
@@ -88,8 +88,30 @@ def test_of_two_thresholds_that_are_equally_good_the_lower_counts(tmp_path: Path
     file = labels(tmp_path / "a.parquet", {episode: [0.0, episode / 10] for episode in range(8)})
     (found,) = evaluate_labels([file], {episode: episode in (2, 6) for episode in range(8)}).evaluations
     assert found.by_progress is not None
-    assert found.by_progress.threshold == pytest.approx(0.2)  # at 0.6, 1/2 and 5/6 are right, whose mean is 2/3, too
+    assert found.by_progress.threshold == 0.15  # at 0.55, 1/2 and 5/6 are right, whose mean is 2/3, too
     assert found.by_progress.balanced_accuracy == pytest.approx((1 + 1 / 3) / 2)
+
+
+BARELY_MORE = float(np.nextafter(np.float32(0.9), np.float32(1)))
+THRESHOLDS = {
+    "far apart": (0.03, 0.99885, "0.5144", 1),
+    "closer than four decimals": (0.99881, 0.99885, "0.99883", 1),
+    "neighbours in float32": (0.9, BARELY_MORE, "0.90000001", 1),
+    "failures have the higher number": (0.9, 0.8, "0.4000", 0.5),
+}
+
+
+@pytest.mark.parametrize(("failure", "success", "threshold", "accuracy"), THRESHOLDS.values(), ids=THRESHOLDS)
+def test_the_printed_threshold_gives_the_printed_accuracy(
+    tmp_path: Path, failure: float, success: float, threshold: str, accuracy: float
+) -> None:
+    values = {0: [failure], 1: [success]}
+    file = labels(tmp_path / "rfm_progress.parquet", values, values)
+    done = rfm_client("evaluate", tmp_path, "--outcome", written(tmp_path / "a.csv", "episode,success\n0,0\n1,1\n"))
+    assert done.stdout.splitlines()[4].split()[-3:-1] == [threshold, f"{accuracy:.4f}"]
+    succeeds = parquet.read_table(file)["success"].to_numpy() >= float(threshold)
+    assert (succeeds == [False, True]).mean() == accuracy
+    assert "note: fewer than 10 successes or failures: AUROC may be off by 0.2 or more" in done.stderr
 
 
 def test_the_order_is_that_of_successes_and_a_constant_curve_has_none(tmp_path: Path) -> None:
@@ -118,7 +140,7 @@ def written(file: Path, text: str) -> str:
 
 
 def test_outcomes_are_read_from_a_table_the_frames_or_the_episodes(tmp_path: Path) -> None:
-    outcomes = read_outcomes(written(tmp_path / "a.csv", "\ufeffepisode,success\n0,1\n1,FALSE\n2,\n"))
+    outcomes = read_outcomes(written(tmp_path / "a.csv", "\ufeffepisode, success\n0, 1\n1,FALSE\n2,\n"))
     assert outcomes == {0: True, 1: False, 2: None}
     v30, v21 = copied("toy_v30_many", tmp_path), copied("toy_v21", tmp_path)
     for file in sorted(v30.rglob("data/**/*.parquet")):
@@ -203,8 +225,8 @@ REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda folder: read_outcomes("timestamp", copied("toy_v30_many", folder)),
         r"outcome: timestamp: episode \d: expected true, false, 1, 0, success or failure, got ",
     ),
-    "other headers": (
-        lambda folder: read_outcomes(written(folder / "a.csv", "id,ok\n0,1\n")),
+    "other headers, and a cell too many": (
+        lambda folder: read_outcomes(written(folder / "a.csv", "id,ok\n0,1,2\n")),
         r"a\.csv: expected the columns episode and success, got id, ok",
     ),
     "an episode twice, by number and by name": (

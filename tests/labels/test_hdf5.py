@@ -284,7 +284,7 @@ def test_labels_of_two_files_in_a_folder_are_kept_apart(three: Path) -> None:
         assert shown.exit_code == 0, shown.stderr
     assert invoke("evaluate", three).exit_code == 0
     shown = invoke("label", three, "--report", "--name", "gone")
-    assert "demos.gone_progress.parquet: expected a file of labels, got none: label the dataset first" in shown.stderr
+    assert f"{three.parent}: expected --name with one of the labels mine, got 'gone'" in shown.stderr
 
 
 GONE, OUTSIDE = h5py.SoftLink("/nowhere"), h5py.ExternalLink("gone.hdf5", "/data")

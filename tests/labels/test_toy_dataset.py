@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 import toy_dataset
 from in_process import rfm_app, rfm_client_app
 from paths import ROOT
+from rfm_client.contract.description import TOY
 from rfm_labels import evaluate_labels, read_outcomes
 
 GUIDE = ROOT / "docs" / "guides" / "how_good_is_it.md"
@@ -54,7 +55,9 @@ def test_the_guide_s_commands_tell_the_trained_checkpoint_from_the_early_one(
 
     toy = tmp_path / "demo_output" / "toy"
     files = [toy / f"{name}_progress.parquet" for name in ("early", "full")]
-    early, full = evaluate_labels(files, read_outcomes(str(toy / "outcomes.csv"))).evaluations
+    comparison = evaluate_labels(files, read_outcomes(str(toy / "outcomes.csv")))
+    assert comparison.notes == [f"early, full: {TOY}"]
+    early, full = comparison.evaluations
     assert early.by_progress is not None
     assert full.by_progress is not None
     assert full.by_progress.auroc > early.by_progress.auroc + 0.2  # five times the training

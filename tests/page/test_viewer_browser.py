@@ -107,6 +107,7 @@ def test_dropped_clips_get_the_curves_of_the_command_line(page: Page) -> None:
     assert [video["source"] for video in document["videos"]] == ["success.mp4", "failure.mp4"]
     assert page.browser["warning"].text == f"{TOY}; rfm serve robometer/Robometer-4B serves a public checkpoint"
     videos = by_command_line(page.videos, page.browser["command"].text)["videos"]
+    assert {video["warning"] for video in videos} == {TOY}
     for shown, video, row in zip(document["videos"], videos, page.browser.cells("#curves tr"), strict=True):
         for name in ("progress", "success", "frame_times_s"):
             np.testing.assert_allclose(shown[name], video[name], rtol=0, atol=TOLERANCE, err_msg=name)
@@ -251,10 +252,10 @@ def compared(page: Page, *names: str) -> tuple[Any, Any]:
     (answer,) = page.saved()["comparisons"]
     (command,) = [line for line in page.browser["command"].text.splitlines() if line.startswith("rfm-client compare")]
     told = by_command_line(page.videos, f"{command} --json ranking.json")
-    for ours, theirs in zip(answer["orders"], told["orders"], strict=True):
+    for ours, theirs in zip(answer["orders"] + answer["pairs"], told["orders"] + told["pairs"], strict=True):
         assert ours.pop("preference") == pytest.approx(theirs.pop("preference"), abs=TOLERANCE)
         assert ours == theirs
-    assert answer["pairs"] == told["pairs"]
+    assert told["warning"] == TOY
     assert [video["rank"] for video in answer["videos"]] == [video["rank"] for video in told["videos"]]
     return page.saved()["comparisons"][0], told
 

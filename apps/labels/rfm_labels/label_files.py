@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client import Float32Array
+from rfm_client import Float32Array, ModelInfo
 from rfm_labels.datasets.dataset import SIGNALS_FOLDER
 from rfm_labels.datasets.faults import DatasetError, listed, require
 from rfm_labels.datasets.hdf5 import label_prefix
@@ -213,6 +213,11 @@ class LabelFile:
         """Where the checkpoint comes from, else its digest; empty: unknown."""
         checkpoint = self.provenance.get("checkpoint") or {}
         return str(checkpoint.get("source") or checkpoint.get("weights_digest") or "")
+
+    @property
+    def warning(self) -> str | None:
+        """As in ``rfm_client.ModelInfo``, about the checkpoint."""
+        return ModelInfo.warning_of((self.provenance.get("checkpoint") or {}).get("weights_digest"))
 
     @classmethod
     def read(cls, path: Path) -> LabelFile:

@@ -66,11 +66,13 @@ def _of_csv(file: Path, names: Mapping[int, str]) -> Stored:
     known = {text: number for number, name in names.items() for text in (name, named(number, name))}
     try:
         with file.open(newline="", encoding="utf-8-sig") as content:
-            rows = list(csv.DictReader(content))
+            table = csv.DictReader(content)
+            table.fieldnames = header = [name.strip() for name in table.fieldnames or ()]
+            rows = list(table)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DatasetError.at(file, "a CSV file", error) from error
-    got = ", ".join(rows[0]) if rows else "no rows"
-    require(file, bool(rows) and {_EPISODE, _SUCCESS} <= rows[0].keys(), f"the columns {_EPISODE} and {_SUCCESS}", got)
+    got = ", ".join(header) if rows else "no rows"
+    require(file, bool(rows) and {_EPISODE, _SUCCESS} <= {*header}, f"the columns {_EPISODE} and {_SUCCESS}", got)
     stored: dict[Any, tuple[str, Sequence[Any]]] = {}
     for number, row in enumerate(rows, 2):
         where, text = f"{file}: line {number}", (row[_EPISODE] or "").strip()

@@ -13,7 +13,7 @@ from rfm_labels.label_files import read_provenance
 
 WIDTH_IN = 7.0  # page width
 AXES_IN = 1.3  # height
-HEADLINE_IN = 0.5
+HEADLINE_IN, NOTE_IN = 0.5, 0.13
 BINS = 20
 STYLE = "rfm_client.figure"  # the shared style file defines what each colour means
 SUCCESS_COLOUR, FAILURE_COLOUR = "C0", "C1"  # blue and orange, which colour-blind people tell apart
@@ -29,7 +29,8 @@ def draw_evaluation(file: Path, comparison: LabelComparison, labels: Sequence[Pa
 
     count = len(comparison.evaluations)
     with matplotlib.style.context(STYLE, after_reset=True):
-        figure = Figure(figsize=(WIDTH_IN, HEADLINE_IN + AXES_IN * count), layout="constrained")
+        height_in = HEADLINE_IN + NOTE_IN * len(comparison.notes) + AXES_IN * count
+        figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
         axes = figure.subplots(count, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
         origins, known = [_origin(each) for each in labels], comparison.is_success
         for ax, each, (_, checkpoint) in zip(axes, comparison.evaluations, origins, strict=True):
@@ -51,7 +52,7 @@ def draw_evaluation(file: Path, comparison: LabelComparison, labels: Sequence[Pa
             ax.yaxis.get_major_locator().set_params(integer=True)
         axes[-1].set_xlabel("progress at the last frame")
         datasets = ", ".join(dict.fromkeys(dataset for dataset, _ in origins))
-        title = f"{datasets}: {counted(len(comparison.episodes), 'episode')}"
+        title = "\n".join([f"{datasets}: {counted(len(comparison.episodes), 'episode')}", *comparison.notes])
         figure.suptitle(title, x=0.01, ha="left", fontsize=8)
         if known is not None:
             figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=2)

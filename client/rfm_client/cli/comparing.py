@@ -12,6 +12,7 @@ from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.scoring import Source, report_warnings
 from rfm_client.cli.show import at_end, number, table, title_at_end
 from rfm_client.client import RewardClient
+from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.ranking import Ranking
 from rfm_client.contract.results import PreferenceResult, ProgressResult, one_version
@@ -31,6 +32,7 @@ class Comparison(Ranking):
     scores: for each source alone, as from ``score``; in a preference they depend on the other source
     """
 
+    info: ModelInfo
     sources: Sequence[Source]
     scores: Sequence[ProgressResult]
 
@@ -73,7 +75,7 @@ def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> 
     one_version((*scores, *answers), "all videos")
     report_warnings([info])
     results = dict(zip(orders, cast("list[PreferenceResult]", answers), strict=True))
-    return Comparison(sources=sources, scores=scores, results=results)
+    return Comparison(info=info, sources=sources, scores=scores, results=results)
 
 
 def _of_one_task(first: Source, other: Source) -> Trajectory:

@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from rfm_client.cli.comparing import Comparison
 from rfm_client.cli.options import PrefixOptions, ServerOptions, VideoOptions
-from rfm_client.cli.scoring import Outcome, Scored, Times
+from rfm_client.cli.scoring import Outcome, Scored, Times, checkpoint_name
+from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.results import (
     FRAME_SCORES,
@@ -35,10 +36,10 @@ def score_document(
 
 
 def comparison_document(server: ServerOptions, video: VideoOptions, comparison: Comparison) -> dict[str, Any]:
-    """Return the document for ``compare --json``. ``preference`` is the probability that an order's first video wins.
+    """Return the document for ``compare --json``, with ``orders`` and ``pairs`` as in ``Ranking.document``.
 
-    For two videos, the top level also has the ``preference`` in the given order, the verdict from both orders, and
-    scores as ``first`` and ``second``. Scores are those from ``score``. A missing verdict, rank or ranking is null.
+    For two videos, the top level also has what their pair has, and scores as ``first`` and ``second``. Scores are those
+    from ``score``. A missing verdict, rank or ranking is null.
     """
     videos = [
         {
@@ -53,10 +54,10 @@ def comparison_document(server: ServerOptions, video: VideoOptions, comparison: 
         )
     ]
     answers = comparison.document([source.name for source in comparison.sources])
-    asked = comparison.results[0, 1]
-    document = {**server.origin, **_asked(video), "model_version": asked.model_version}
+    document = {**server.origin, **_asked(video), "model_version": comparison.model_version}
+    document |= _checkpoint(comparison.info)
     if len(videos) == len(SIDES):
-        document |= {"preference": asked.preference, **answers["pairs"][0], **dict(zip(SIDES, videos, strict=True))}
+        document |= {**answers["pairs"][0], **dict(zip(SIDES, videos, strict=True))}
     best_first = comparison.ranking
     ranking = None if best_first is None else [videos[index] for index in best_first]
     return {**document, **answers, "videos": videos, "ranking": ranking}
@@ -113,7 +114,11 @@ def _outcome(outcome: Outcome) -> dict[str, Any]:
         return {"source": outcome.name, **_error(outcome.error, outcome.message)}
     about = {"source": outcome.name, "num_frames": outcome.num_frames, "took_s": outcome.took_s}
     scores = frame_document(outcome.result, outcome.times_s)
-    return {**about, "model_version": outcome.result.model_version, **scores}
+    return {**about, "model_version": outcome.result.model_version, **_checkpoint(outcome.info), **scores}
+
+
+def _checkpoint(info: ModelInfo) -> dict[str, Any]:
+    return {"checkpoint": checkpoint_name(info), "warning": info.warning}
 
 
 def _error(error: Exception, message: str) -> dict[str, Any]:

@@ -221,11 +221,12 @@ def _evaluate(
 def heading(task: str, infos: Iterable[ModelInfo], caption: str | None = None) -> str:
     """Return a figure's title: the caption, else the task and the checkpoints; a warning replaces a name."""
     title = f'"{task}"' * (not is_blank(task)) if caption is None else caption
-    told = (info.warning or (_checkpoint(info) if caption is None else "") for info in infos)
+    told = (info.warning or (checkpoint_name(info) if caption is None else "") for info in infos)
     return "\n".join(filter(None, [title, ", ".join(filter(None, dict.fromkeys(told)))]))
 
 
-def _checkpoint(info: ModelInfo) -> str:
+def checkpoint_name(info: ModelInfo) -> str:
+    """Return where the checkpoint comes from, else the model's name."""
     source = info.source or info.name
     run = source.removesuffix("/checkpoint")  # a name, unless the folder is a version
     return source if run.isdecimal() else run

@@ -47,7 +47,10 @@ class Ranking:
         return itertools.combinations(self.numbers, 2)
 
     def document(self, names: Sequence[object]) -> dict[str, list[dict[str, object]]]:
-        """Return the answers for JSON, in both ``orders`` and of the ``pairs``. names: of the trajectories"""
+        """Return the answers for JSON, in both ``orders`` and of the ``pairs``. names: of the trajectories
+
+        ``preference`` is the probability that the first one wins, of a pair averaged over both orders.
+        """
 
         def of(first: int, second: int, **answer: object) -> dict[str, object]:
             return {"first": names[first], "second": names[second], **answer}
@@ -55,7 +58,10 @@ class Ranking:
         pairs = [(couple, self.pair(*couple)) for couple in self.couples()]
         return {
             "orders": [of(*order, preference=result.preference) for order, result in sorted(self.results.items())],
-            "pairs": [of(*couple, verdict=pair.verdict, orders_agree=pair.orders_agree) for couple, pair in pairs],
+            "pairs": [
+                of(*couple, preference=pair.preference, verdict=pair.verdict, orders_agree=pair.orders_agree)
+                for couple, pair in pairs
+            ],
         }
 
     @cached_property

@@ -195,10 +195,11 @@ def unreachable(url: str, reason: str) -> errors.ServerUnavailableError:
 
 def not_served(model: str, message: str, served: Collection[str]) -> errors.ModelNotFoundError:
     """Return the error for a missing model, with the served models' names and the remedy."""
-    takes_frames = frames_name(model) in served
-    remedy = (
-        "this checkpoint takes no embeddings: give frames, and ask model_info(frames=True)" if takes_frames else _NAME
-    )
+    remedy = _NAME
+    if frames_name(model) in served:
+        remedy = "this checkpoint takes no embeddings: give frames, and ask model_info(frames=True)"
+    elif model in map(frames_name, served):
+        remedy = "this checkpoint takes embeddings alone: export it with --image-encoder and --text-encoder"
     names = ", ".join(sorted(served)) or "none"
     return _with_remedy(errors.ModelNotFoundError, f"{message}; served: {names}", remedy)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rfm_client.command_line import JsonOutput, number, print_table, with_options
+from rfm_client.command_line import JsonOutput, number, print_table, report, with_options
 from rfm_client.options import counted, first_names, setting
 
 if TYPE_CHECKING:
@@ -73,6 +73,8 @@ def evaluate(
     comparison = evaluate_labels(files, outcomes)
     if output.prints_tables:
         _print_tables(comparison)
+    for note in comparison.notes:
+        report(f"note: {note}")
     output.write_json(document(comparison))
     if output.plot is not None:
         from rfm_labels.pictures import draw_evaluation
@@ -89,9 +91,10 @@ def _print_tables(comparison: LabelComparison) -> None:
     for each in comparison.evaluations:
         cells = [each.name, number(each.spearman), number(each.kendall), str(each.num_constant), number(each.final)]
         if known is not None:
-            aurocs = [ranking and ranking.auroc for ranking in (each.by_success, each.by_progress)]
-            by_vote = each.by_success and (each.by_success.threshold, each.by_success.balanced_accuracy)
-            cells += map(number, (each.final_of_successes, each.final_of_failures, *aurocs, *(by_vote or (None, None))))
+            aurocs = [None if ranking is None else ranking.auroc for ranking in (each.by_success, each.by_progress)]
+            cells += map(number, (each.final_of_successes, each.final_of_failures, *aurocs))
+            best = each.by_success
+            cells += ["-", "-"] if best is None else [_exact(best.threshold), number(best.balanced_accuracy)]
         rows.append([*cells, f"{each.backwards:.1%}"])
     counts = counted(len(comparison.episodes), "episode")
     if known is not None:
@@ -105,6 +108,11 @@ def _print_tables(comparison: LabelComparison) -> None:
         counts += f"; {unused} unused, of episodes without labels: {first_names(comparison.without_labels)}"
     legend = VOC.format("all episodes") if known is None else VOC.format("successes") + BY_OUTCOME
     print_table(counts, columns, rows, legend + FALLS)
+
+
+def _exact(threshold: float) -> str:
+    """Return the threshold with four decimals, or with all that separate it from its neighbours."""
+    return number(threshold) if round(threshold, 4) == threshold else str(threshold)
 
 
 def document(comparison: LabelComparison) -> dict[str, Any]:

@@ -405,6 +405,9 @@ class LabelCommand:
             outputs = self._outputs(self.labels)
             files = [*outputs.progress, *outputs.signals]
             path = next((file for file in files if file.exists()), files[0])
+            if not path.exists() and (others := self._there()):
+                expected = f"--name with one of the labels {', '.join(others)}"
+                raise DatasetError.at(outputs.folder, expected, repr(self.labels.name))
         summary = summarise(path)
         for line in blank_lines(read_blank(path), len(summary.episodes)):
             self.say(f"note: {line}")
