@@ -54,7 +54,8 @@ def _found(folder: Path) -> tuple[str, str]:
     below = next((file.parent.parent for file in sorted(folder.glob(f"*/*/{CONFIG_FILE}"))), None)
     if below is not None:
         return "a folder that has one", f"--repository {below}"
-    if any((inner := folder / CHECKPOINT_FOLDER).glob(_WEIGHTS)):
+    inner = folder / CHECKPOINT_FOLDER
+    if any((inner / name).exists() for name in CHECKPOINT_FILES):
         there = [name for name in ("image_encoder", "text_encoder") if (folder / name).is_dir()]
         options = "".join(f" --{name.replace('_', '-')} {folder / name}" for name in there)
         return "a folder that holds a checkpoint", f"rfm serve {inner}{options} exports and serves it"
