@@ -108,7 +108,8 @@ def test_the_printed_threshold_gives_the_printed_accuracy(
     values = {0: [failure], 1: [success]}
     file = labels(tmp_path / "rfm_progress.parquet", values, values)
     done = rfm_client("evaluate", tmp_path, "--outcome", written(tmp_path / "a.csv", "episode,success\n0,0\n1,1\n"))
-    assert done.stdout.splitlines()[4].split()[-3:-1] == [threshold, f"{accuracy:.4f}"]
+    (row,) = [line.split() for line in done.stdout.splitlines() if line.split()[:1] == ["rfm"]]
+    assert row[-3:-1] == [threshold, f"{accuracy:.4f}"]
     succeeds = parquet.read_table(file)["success"].to_numpy() >= float(threshold)
     assert (succeeds == [False, True]).mean() == accuracy
     assert "note: fewer than 10 successes or failures: AUROC may be off by 0.2 or more" in done.stderr
