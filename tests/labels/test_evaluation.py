@@ -108,7 +108,7 @@ def test_the_printed_threshold_gives_the_printed_accuracy(
     values = {0: [failure], 1: [success]}
     file = labels(tmp_path / "rfm_progress.parquet", values, values)
     done = rfm_client("evaluate", tmp_path, "--outcome", written(tmp_path / "a.csv", "episode,success\n0,0\n1,1\n"))
-    (row,) = [line.split() for line in done.stdout.splitlines() if line.split()[:1] == ["rfm"]]
+    *_, row = [line.split() for line in done.stdout.splitlines() if line.split()[:1] == ["rfm"]]  # of the last columns
     assert row[-3:-1] == [threshold, f"{accuracy:.4f}"]
     succeeds = parquet.read_table(file)["success"].to_numpy() >= float(threshold)
     assert (succeeds == [False, True]).mean() == accuracy
