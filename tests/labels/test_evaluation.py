@@ -103,13 +103,13 @@ THRESHOLDS = {
 
 @pytest.mark.parametrize(("failure", "success", "threshold", "accuracy"), THRESHOLDS.values(), ids=THRESHOLDS)
 def test_the_printed_threshold_gives_the_printed_accuracy(
-    tmp_path: Path, failure: float, success: float, threshold: str, accuracy: float
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: float, success: float, threshold: str, accuracy: float
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "120")  # all columns in one row
     values = {0: [failure], 1: [success]}
     file = labels(tmp_path / "rfm_progress.parquet", values, values)
     done = rfm_client("evaluate", tmp_path, "--outcome", written(tmp_path / "a.csv", "episode,success\n0,0\n1,1\n"))
-    *_, row = [line.split() for line in done.stdout.splitlines() if line.split()[:1] == ["rfm"]]  # of the last columns
-    assert row[-3:-1] == [threshold, f"{accuracy:.4f}"]
+    assert done.stdout.splitlines()[4].split()[-3:-1] == [threshold, f"{accuracy:.4f}"]
     succeeds = parquet.read_table(file)["success"].to_numpy() >= float(threshold)
     assert (succeeds == [False, True]).mean() == accuracy
     assert "note: fewer than 10 successes or failures: AUROC may be off by 0.2 or more" in done.stderr
