@@ -335,7 +335,7 @@ def test_a_missing_task_or_a_broken_video_is_named_and_the_others_are_scored(pag
     told = "This browser cannot show this file, and it was not scored: see the numbers below."
     page.browser.until(f"document.querySelector('#videos figure p').textContent === '{told}'")
     assert page.browser.all("#videos figure p")[0].is_displayed()
-    assert not page.browser["compare"].is_enabled()  # of two videos one has failed
+    assert not page.browser["compare"].is_displayed()  # of two videos one has failed
     page.drop("failure")
     page.browser.until_text("scored", "2 of 3 scored, 1 failed")
     page.browser["compare"].click()

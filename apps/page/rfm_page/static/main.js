@@ -345,8 +345,10 @@ async function compareAll() {
       tell({ videos: all, task, model, fps, orient, channels, resize, answer });
     }
   } catch (error) {
-    error.message = error.message.replace(/\bvideo_(\d+)/g, (field, index) => all[index]?.name ?? field);
-    if (!signal.aborted) failed(error, "The videos could not be compared", compareAll);
+    if (!signal.aborted) {
+      error.message = error.message.replace(/\bvideo_(\d+)/g, (field, index) => all[index]?.name ?? field);
+      failed(error, "The videos could not be compared", compareAll);
+    }
   }
   comparing = null;
   update();
