@@ -246,7 +246,7 @@ def test_a_call_waits_for_its_only_server_to_be_back() -> None:
     assert (only.asked["infer"], only.asked["while down"]) == (32, 0)
 
 
-def test_a_server_that_comes_back_with_another_checkpoint_is_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_server_that_comes_back_with_another_checkpoint_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     stand = Stand()
     with RewardClient("", transports=[stand]) as client:
         assert client.model_info().weights_digest == "a" * 16

@@ -297,7 +297,7 @@ class SampleScorer:
         try:
             now = await self.model_info(model, deadline, refresh=True)
         except RewardError as error:
-            logger.warning("%s: a server is back, and whether with the same checkpoint is unknown: %s", model, error)
+            logger.warning("%s: a server is back; cannot tell whether it serves the same checkpoint: %s", model, error)
             return
         if now.weights_digest != before.weights_digest:
             told = [f"{info.source or info.name} (weights {info.weights_digest})" for info in (now, before)]

@@ -15,7 +15,7 @@ const UNSHOWN = { // by the state of its curve
 const NEAR_S = 0.05; // a video that is so near to a time shows it
 const IN_STEP_S = 0.015; // less than half a frame of most cameras
 const NEAR_LEADER_S = 0.2; // so near, the frames that are drawn count, else the times
-const CATCH_UP = 4; // in a second, a video that lags makes up for so many times its lag
+const CATCH_UP = 4; // times its lag that a video makes up for in a second
 const SLOWEST = 0.1; // times the usual speed
 const INSIDE_S = 0.001; // behind the begin of a frame, so that rounding does not show the one before
 
