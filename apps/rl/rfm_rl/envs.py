@@ -96,6 +96,8 @@ class RewardedEnvs:
     def check_step(self, resetting: Mask) -> None:
         """Raise ResetNeeded if an environment needs a reset before the next step.
 
+        Score first frames that a failed call left without a score. Raises RewardError before the environments step.
+
         resetting: environments that only reset in this step
         """
         if len(self.episodes) != len(self.tasks):
@@ -108,6 +110,7 @@ class RewardedEnvs:
                 which = "" if self._is_only else f" of the environments {_numbers(indices)}"
                 expected = f"expected a reset{which}, since {reason}, got another step"
                 raise ResetNeeded(f"step: {expected}; {self._remedy}")
+        self._score({episode: False for episode in self.episodes.values() if episode.known is None})
         self._resetting, self._whole = resetting, np.zeros_like(self._whole)
 
     def keep(
