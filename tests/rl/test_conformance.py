@@ -540,12 +540,13 @@ def test_resets_after_an_error_are_silent(
     recorder: Recorder, warnings: Callable[[], list[str]], kind: type[Door]
 ) -> None:
     """The error at a last step is an end; after others, the reset is the remedy."""
-    with opened(kind, recorder, [CodedEnv(0, (1,))], options(mode="final")) as door:
-        recorder.server.failing = 1
-        door.reset()
-        with pytest.raises(ServerUnavailableError):
-            door.step()
-        door.reset()
+    for length in (1, 3):
+        with opened(kind, recorder, [CodedEnv(0, (length,))], options(mode="final", success_bonus=1.0)) as door:
+            recorder.server.failing = len(recorder.calls) + 1
+            door.reset()
+            with pytest.raises(ServerUnavailableError):
+                door.step()
+            door.reset()
     if kind is not VECTORS["SAME_STEP"]:  # which renders no frames
         with opened(kind, recorder, [CodedEnv(bad=(0, 0, 1))], options(mode="final", frames_from=None)) as door:
             door.reset()
