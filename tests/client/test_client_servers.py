@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import time
 from collections import Counter
 from collections.abc import Collection
@@ -163,6 +164,15 @@ def test_pauses_double_and_half_of_each_is_random(monkeypatch: pytest.MonkeyPatc
     stand.go_down(0.3)
     assert kinds(ask([stand])) == {ProgressResult}
     assert drawn[:3] == [(0.05, 0.1), (0.1, 0.2), (0.2, 0.4)]
+
+
+def test_an_outage_is_logged_once_when_it_begins_and_once_when_it_ends(caplog: pytest.LogCaptureFixture) -> None:
+    stand = Stand("grpc://only:1")
+    stand.go_down(0.3)
+    assert kinds(ask([stand], 20)) == {ProgressResult}
+    begun, ended = (record.message for record in caplog.records)
+    assert begun == "grpc://only:1: trying again for up to 4 s: Connection refused"
+    assert re.fullmatch(r"grpc://only:1: answers again after \d+\.\d s", ended)
 
 
 def kinds(outcomes: list[object]) -> set[type]:

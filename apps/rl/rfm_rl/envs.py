@@ -68,6 +68,7 @@ class RewardedEnvs:
         self._made: RewardClient | None = None
         self._has_dropped = False  # the last reset dropped a reward, and no episode has ended since
         self._has_warned = False
+        self._has_failed = False  # the last request failed
 
     @property
     def succeeded(self) -> Mask:
@@ -75,14 +76,14 @@ class RewardedEnvs:
         return np.array([episode.succeeded for _, episode in sorted(self.episodes.items())], np.bool_)
 
     def check_reset(self, mask: Mask) -> None:
-        """Warn once if a reset drops the reward of unended episodes. Call this before the reset.
+        """Warn once if a reset, unless after an error, drops unended episodes' reward. Call this before the reset.
 
         Raises ValueError in mode ``final`` for the second such reset in a row: episodes that end outside the wrapper
         would never be paid. An end or an error between the resets allows the second.
         """
         running = [self.episodes[index] for index in _numbers(mask & self._whole)]
         unpaid = next((episode for episode in running if episode.is_unpaid), None)
-        if unpaid is not None:
+        if unpaid is not None and not self._has_failed:
             self._check_dropped(unpaid)
         self._resetting, self._kept = mask, self._whole & ~mask
         self._whole = np.zeros_like(mask)
@@ -96,6 +97,8 @@ class RewardedEnvs:
     def check_step(self, resetting: Mask) -> None:
         """Raise ResetNeeded if an environment needs a reset before the next step.
 
+        Score first frames that a failed call left without a score. Raises RewardError before the environments step.
+
         resetting: environments that only reset in this step
         """
         if len(self.episodes) != len(self.tasks):
@@ -108,6 +111,7 @@ class RewardedEnvs:
                 which = "" if self._is_only else f" of the environments {_numbers(indices)}"
                 expected = f"expected a reset{which}, since {reason}, got another step"
                 raise ResetNeeded(f"step: {expected}; {self._remedy}")
+        self._score({episode: False for episode in self.episodes.values() if episode.known is None})
         self._resetting, self._whole = resetting, np.zeros_like(self._whole)
 
     def keep(
@@ -197,10 +201,11 @@ class RewardedEnvs:
 
         episodes: True for an episode whose newest frame is its last
         """
-        has_dropped, self._has_dropped = self._has_dropped, False  # after an error, a reset may drop a reward
+        has_dropped, self._has_dropped = self._has_dropped, False
+        self._has_failed = True  # after an error, a reset may drop a reward
         try:
             self._ask(episodes)
-            self._has_dropped = has_dropped
+            self._has_dropped, self._has_failed = has_dropped, False
         finally:
             for episode in (episode for episode, ends in episodes.items() if ends or episode.succeeded):
                 episode.end()

@@ -18,8 +18,9 @@ other scores that the checkpoint gives by default (``StepScore.more_scores``). W
 ``success_bonus`` there is also ``succeeded``.
 
 ``reset`` and ``step`` raise RewardError; an error never becomes a reward. If the server failed, the episode keeps the
-frame, and in delta mode the next reward includes its change. If the frame was lost, the next ``step`` raises
-ResetNeeded. A step after an episode's end does, too, unless the environment resets in that step.
+frame, and in delta mode the next reward includes its change; a step after such a reset first scores the reset's frame.
+If the frame was lost, the next ``step`` raises ResetNeeded. A step after an episode's end does, too, unless the
+environment resets in that step.
 
 ``compute_reward`` of RewardModelWrapper raises NotImplementedError: hindsight relabelling would mix the environment's
 rewards with the model's. With a Monitor or RecordEpisodeStatistics inside a wrapper, ``info["episode"]`` has the
@@ -33,7 +34,7 @@ between, raises ValueError.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import gymnasium
@@ -81,6 +82,8 @@ class RewardModelWrapper(gymnasium.Wrapper):
         require(
             "env", not resets, "no Autoreset inside", "one; wrap in the other order: Autoreset(RewardModelWrapper(...))"
         )
+        is_task = isinstance(task, str) or callable(task)
+        require("task", is_task, "a task sentence, or a function from a reset's info to it", repr(task))
         super().__init__(env)
         self._envs = RewardedEnvs(client, options, [""], remedy=_REMEDY, is_only=True)
         self._options = options
@@ -148,6 +151,7 @@ def _is_batch(env: gymnasium.Env[Any, Any]) -> bool:
 
 def tasks_of(task: str | Sequence[str], num_envs: int) -> list[str]:
     """Return a task sentence for each environment in a vector. Raises ValueError for another number of sentences."""
+    require("task", isinstance(task, Iterable), "a task sentence, or one for each environment", repr(task))
     tasks = [task] * num_envs if isinstance(task, str) else list(task)
     require("task", len(tasks) == num_envs, f"one for each of the {num_envs} environments", len(tasks))
     return tasks

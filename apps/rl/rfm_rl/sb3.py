@@ -118,7 +118,7 @@ class RewardModelVecEnv(VecEnvWrapper):  # type: ignore[misc]  # its package is 
         return observations
 
     def step_async(self, actions: Any) -> None:
-        """Begin a step. Raises ResetNeeded before a reset, and after a step whose frames were lost."""
+        """Begin a step. Raises ResetNeeded before a reset, and after a step whose frames were lost; RewardError."""
         self._envs.check_step(np.zeros(self.num_envs, np.bool_))
         self.venv.step_async(actions)
 

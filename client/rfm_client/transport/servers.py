@@ -59,6 +59,7 @@ class KnownServer:
     """One of several servers: transport, load and failures.
 
     failures: how often the server was left out since the last success
+    lost_at_s: when a request that is sent again first failed (monotonic clock); None: not since the last success
     comeback: ends when the server reports ready again; None: never left out
     """
 
@@ -67,6 +68,7 @@ class KnownServer:
         self.outstanding = 0
         self.last_request = 0
         self.failures = 0
+        self.lost_at_s: float | None = None
         self.comeback: asyncio.Task[None] | None = None
 
     @property
@@ -226,8 +228,10 @@ class Servers:
                     break
             except ServerUnavailableError as error:
                 failures[server] = error
-                if not server.failures and self._retry:
-                    logger.warning("%s: trying again: %s", server.transport.url, error)
+                if server.lost_at_s is None and self._retry:
+                    server.lost_at_s = time.monotonic()
+                    left_s = max(deadline.at_s - server.lost_at_s, 0.0)
+                    logger.warning("%s: trying again for up to %.0f s: %s", server.transport.url, left_s, error)
                 self._leave_out(server, model, error)
                 if error.may_have_ended_server and has_ended:
                     message = f"a process or the connection ended twice during this request: {error.message}"
@@ -248,6 +252,10 @@ class Servers:
             else:
                 self.returns += server.failures > 0
                 server.failures = 0
+                if server.lost_at_s is not None:
+                    lost_s = time.monotonic() - server.lost_at_s
+                    logger.warning("%s: answers again after %.1f s", server.transport.url, lost_s)
+                    server.lost_at_s = None
                 for other, refusal in refusals.items():  # not before: if all refuse, no server is at fault
                     self._leave_out(other, model, refusal)
                 return answer
