@@ -94,7 +94,7 @@ def _facts(
         description,
         source="/".join(Path(source).resolve().parts[-2:]) if is_local else name,
         revision=None if is_local else tag or None,
-        weights_digest=weights_digest(folders),
+        weights_digest=weights_digest([*folders[1:], folders[0]]),  # encoders first, as served
         settings_digest=_settings_digest(checkpoint, encoders, folders, settings),
         frame_size=description.frame_size if encoders is None else encoders.description.frame_size,
         encodes=encoders is not None,

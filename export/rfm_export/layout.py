@@ -130,7 +130,8 @@ def generated_models(description: Description, encoders: Description | None, ver
     inputs = wire.encoder_inputs(by_digest=has_one_cache)
     encoder = Interface(encoder_name(name), inputs, wire.encoder_outputs(*widths), encodes)
     of_encoder = replace(version, settings=replace(settings, instances=1)) if cache_mib else version
-    models.append(_python_model(encoder, "rfm_encoder", of_encoder, [_encoder_warmup()], keeps=True))
+    warmup = Warmup("frames", wire.encode_frames(blank_trajectory(None, task=WARMUP_TASK)))
+    models.append(_python_model(encoder, "rfm_encoder", of_encoder, [warmup], keeps=True))
     with_frames = replace(description, video_dim=None, text_dim=None, frame_size=encoders.frame_size)
     frames = Interface(frames_name(name), wire.frame_inputs(by_digest=has_one_cache), outputs, with_frames)
     return [*models, GeneratedModel(ensemble_config(frames, settings, version.number, encoder, scorer), version.number)]
@@ -160,10 +161,6 @@ def _warmups(description: Description) -> list[Warmup]:
     if description.has_similarity:
         samples["similarity"] = SimilaritySample(trajectory, trajectory)
     return [Warmup(name, wire.encode_samples([sample])) for name, sample in samples.items()]
-
-
-def _encoder_warmup() -> Warmup:
-    return Warmup("frames", wire.encode_frames(blank_trajectory(None, task=WARMUP_TASK)))
 
 
 def description_in(config: pb.ModelConfig) -> Description:

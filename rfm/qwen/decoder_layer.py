@@ -43,10 +43,6 @@ class DecoderLayer:
             self._norm = deepcopy(attention.q_norm)
             self._norm.weight = nn.Parameter(weight, requires_grad=False)  # [heads of queries and keys, E]
 
-    def is_of(self, layer: Any) -> bool:
-        """True if made from this layer, with these weights of its norms, of which it holds a copy."""
-        return self._sources == _sources(layer)
-
     def __call__(self, states: Tensor, turn: tuple[Tensor, Tensor], mask: Tensor | None, cache: Cache | None) -> Tensor:
         """Return the states behind the layer, [B, L, D] -> [B, L, D].
 
@@ -103,7 +99,7 @@ def decoder_layers(language: Any) -> list[DecoderLayer]:
     """
     made: list[DecoderLayer] = vars(language).get("_decoder_layers", [])
     layers = list(language.layers)
-    if len(made) != len(layers) or not all(map(DecoderLayer.is_of, made, layers)):
+    if [each._sources for each in made] != [_sources(layer) for layer in layers]:  # a layer holds copies of them
         if torch.cuda.is_available() and torch.cuda.is_current_stream_capturing():
             raise RuntimeError("expected the weights of the last pass, got others")
         made = [DecoderLayer(layer, number) for number, layer in enumerate(layers)]

@@ -203,7 +203,7 @@ class LanguageCheckpoint(QwenCheckpoint):
             preprocessor = {**preprocessor, "min_pixels": None, "max_pixels": None}
         normalisation = normalisation_of(preprocessor, SIZED_BY_PROCESSOR, where)
         patch = patch_px(preprocessor, self.config.backbone["vision_config"], where)
-        collator = self.make_collator(tokenizer, patch, normalisation)
+        collator: LanguageCollator = self.collator_of(self.config, tokenizer, self.images(patch, normalisation))
         collator.check_template()
         return collator
 
@@ -221,10 +221,6 @@ class LanguageCheckpoint(QwenCheckpoint):
         if self.has_language_head and HEAD not in self.weights:
             network.lm_head.weight = network.model.language_model.embed_tokens.weight
         return network
-
-    def make_collator(self, tokenizer: Any, patch_px: int, normalisation: Normalisation) -> Any:
-        """Return the collator with this tokenizer and preprocessing."""
-        return self.collator_of(self.config, tokenizer, self.images(patch_px, normalisation))
 
     def images(self, patch_px: int, normalisation: Normalisation) -> QwenImages:
         """Return the preprocessing; by default that of separate images whose pixels the configuration bounds."""

@@ -16,7 +16,9 @@ from pyarrow import parquet
 import engines
 from labelling import FRONT, LEROBOT, WRIST, BrightnessScorer, Notes
 from paths import ROOT
-from rfm_client import ProgressSample, RewardClient, Trajectory
+from repositories import description_of
+from rfm_client import ModelInfo, ProgressSample, RewardClient, Trajectory
+from rfm_client.contract.description import TOY
 from rfm_client.frames import Rule, Sampling
 from rfm_labels import (
     ClientScorer,
@@ -49,6 +51,14 @@ def test_a_checkpoint_is_another_with_other_settings(tmp_path: Path) -> None:
         told.append(engine_scorer(tmp_path / "checkpoint", tmp_path).checkpoint())
     assert len({facts.settings_digest for facts in told}) == 3
     assert len({facts.weights_digest for facts in told}) == 1
+
+
+def test_a_toy_checkpoint_is_the_same_in_this_process_and_served() -> None:
+    scorer = engine_scorer(MODELS / "rfm" / "1" / "checkpoint", MODELS / "rfm_encoder" / "1")
+    assert scorer.checkpoint().weights_digest == description_of(MODELS / "rfm_frames").weights_digest
+    early = ROOT / "examples" / "early_checkpoint"
+    facts = [scorer.checkpoint(), engine_scorer(early / "checkpoint", early).checkpoint()]
+    assert [ModelInfo.warning_of(each.weights_digest) for each in facts] == [TOY, TOY]
 
 
 def progress_of(report: Report) -> dict[str, np.ndarray[Any, Any]]:

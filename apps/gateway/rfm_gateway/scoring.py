@@ -84,7 +84,8 @@ class Evaluator:
         texts = await self._texts(batch.samples, request_id) if embeddings is not None else {}
         use_frame_steps = self.use_frame_steps if batch.use_frame_steps is None else batch.use_frame_steps
         by_prefix = use_frame_steps and frames is not None and frames.scores_whole_prefixes
-        frame_steps = _frame_steps(frames) if use_frame_steps and not by_prefix else 0
+        steps = FRAME_STEPS if frames is None or frames.has_progress else FRAME_STEPS_FOR_SECONDS
+        frame_steps = steps if use_frame_steps and not by_prefix else 0
         conversion = _Conversion(embeddings, frames, texts, frame_steps, self.refuse_blank)
         samples, warning = await off_loop(batch.num_bytes, conversion.samples, batch)
         asked = [_prefixes(sample) if by_prefix else [sample] for sample in samples]
@@ -234,10 +235,6 @@ class _Conversion:
         if self.refuse_blank:
             refuse_blank_frames(trajectory)
         return trajectory
-
-
-def _frame_steps(frames: ModelInfo | None) -> int:
-    return FRAME_STEPS if frames is None or frames.has_progress else FRAME_STEPS_FOR_SECONDS
 
 
 def _prefixes(sample: Sample) -> list[Sample]:

@@ -18,10 +18,8 @@ from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError,
 DESCRIPTION_PARAMETER = "description"  # parameter in config.pbtxt
 TOY = "toy checkpoint: scores of real videos mean nothing"
 PUBLIC_CHECKPOINT = "robometer/Robometer-4B"
-_TOYS = (  # weights_digest of the toy checkpoints in this repository
-    *("7771918ab039e37c", "b26fc8fb5d62a7a2"),  # served
-    *("55d423cfa3eb137c", "dbdcb2f533704a8d"),  # in the process of `rfm label`, which reads the files in another order
-)
+# weights_digest of the toy checkpoints in this repository: the demo's; the early one's, exported and as it was trained
+_TOYS = ("7771918ab039e37c", "b26fc8fb5d62a7a2", "a21b3f750890fd03")
 _WHERE = f"parameter {DESCRIPTION_PARAMETER}"
 
 Rule: TypeAlias = Literal["shortest", "exact"]

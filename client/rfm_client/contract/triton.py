@@ -131,7 +131,7 @@ def error_from(raised: Exception, url: str, bad_request: BadRequest = invalid_sa
 
 def _error_of_answer(answer: Any, url: str, bad_request: BadRequest) -> errors.RewardError:
     status, message = str(answer.status()), answer.message() or ""
-    if is_denied(status, message):
+    if status in DENIED or (status == "StatusCode.UNAVAILABLE" and _NO_TRUST.search(message) is not None):
         return denied(url, status, message)
     if status == "StatusCode.UNAVAILABLE" and (_NO_CONNECTION.search(message) or _PROXY_ALONE in message):
         return unreachable(url, message)
@@ -157,11 +157,6 @@ def error_of(status: str, message: str, bad_request: BadRequest) -> errors.Rewar
         is_lost = _LOST_CONNECTION.search(text) is not None and not _NO_CONNECTION.search(text)
         error.may_have_ended_server = is_lost or status in BAD_GATEWAY
     return error
-
-
-def is_denied(status: str, message: str) -> bool:
-    """True if one side refused the other: a missing or wrong key, or an untrusted certificate."""
-    return status in DENIED or (status == "StatusCode.UNAVAILABLE" and _NO_TRUST.search(message) is not None)
 
 
 def bearer_headers(key: str) -> dict[str, str]:
