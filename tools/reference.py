@@ -10,15 +10,12 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable
-from dataclasses import MISSING
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rfm.families.robometer.network import VlmConfig
 from rfm.published.robometer_run import SETTINGS, RunConfig
-from rfm_client.contract.settings import Setting, Settings
-from rfm_commands.config import FASTAPI_KEYS, SECTIONS
+from rfm_commands.config import FASTAPI_KEYS
 
 DOCUMENTS = sorted((Path(__file__).parents[1] / "docs" / "reference").glob("*.md"))
 BLOCK = re.compile(r"(<!-- ([\w ]+): made by make reference -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -30,25 +27,9 @@ def current(file: Path) -> str:
     return BLOCK.sub(lambda found: f"{found[1]}\n{LISTS[found[2]]()}\n{found[3]}", file.read_text())
 
 
-def _section(kind: type[Settings]) -> str:
-    return "".join(f"- {_key(key, each)}: {_meaning(each)}\n" for key, each in kind.settings().items())
-
-
-def _key(key: str, setting: Setting) -> str:
-    """Format a key, with its option if that is not the key with dashes."""
-    if setting.has_option and setting.option == f"--{key.replace('_', '-')}":
-        return f"`{key}`"
-    return f"`{key}` (`{setting.option}`)" if setting.has_option else f"`{key}` (no option)"
-
-
-def _meaning(setting: Setting) -> str:
-    default = _text(setting.default)
-    return f"{setting.help} Default: {default}." if default else setting.help
-
-
 def _text(value: Any) -> str:
     """Format a value as in the file; empty for none."""
-    if value is None or value is MISSING or value == ():
+    if value is None:
         return ""
     return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)
 
@@ -68,7 +49,6 @@ def _run_settings() -> str:
 
 
 LISTS: dict[str, Callable[[], str]] = {
-    **{name: partial(_section, kind) for name, kind in SECTIONS.items()},
     "fastapi": lambda: "".join(f"- `{key}`: `{here}`\n" for key, here in FASTAPI_KEYS.items()),
     "run settings": _run_settings,
 }
