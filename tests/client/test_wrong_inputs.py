@@ -56,6 +56,8 @@ def bad(option: str, problem: str) -> str:
 USAGE = {
     "rfm-client score": "Missing argument 'VIDEO...'.",
     "rfm-client score a.mp4 --tsk x": "No such option: --tsk (Possible options: --fps, --task)",
+    "rfm-client score a.mp4": bad("--task", "expected a sentence, got none"),
+    "rfm-client compare a.mp4 b.npz --task N/A": bad("--task", "expected a sentence, got 'N/A'"),
     "rfm-client score a.mp4 --fps zero": bad("--fps", "expected a number, got 'zero'"),
     "rfm-client score a.mp4 --fps 0": bad("--fps", "expected at least 0.001, got 0.0"),
     "rfm-client score a.mp4 --fps nan": bad("--fps", "expected a finite number, got nan"),
@@ -65,7 +67,7 @@ USAGE = {
     "rfm-client score a.mp4 --plot nowhere/a.png": bad(
         "--plot", "expected a folder at nowhere, got none: mkdir -p nowhere"
     ),
-    "rfm-client score a.mp4 --url localhost:8001": bad("--url", f"{URL} 'localhost:8001'"),
+    "rfm-client score a.mp4 --task x --url localhost:8001": bad("--url", f"{URL} 'localhost:8001'"),
     "rfm-client score a.mp4 --ca-file key.pem": bad(
         "--ca-file", "expected certificates (PEM) at key.pem, got a file without certificate"
     ),
@@ -113,7 +115,7 @@ FAILURES = {
         f"{command} --url {url}": (3, f"{url}: no connection: Connection refused: {STARTED}")
         for command, url in (
             *(("rfm-client status", NOBODY), ("rfm-client status", "http://localhost:1")),
-            ("rfm-client score a.mp4", NOBODY),
+            ("rfm-client score a.mp4 --task x", NOBODY),
         )
     },
     "rfm-client evaluate nope": (1, "nope: expected a labelled dataset, got no file or folder of this name"),

@@ -145,6 +145,7 @@ def compare(
     if len(videos) < MIN_COMPARED:
         raise typer.BadParameter(f"expected at least {MIN_COMPARED} videos, got {len(videos)}", param_hint="VIDEO")
     output.begin()
+    video.begin(videos)
     with server.connected() as client:
         comparison = comparing.compare(client, videos, video)
     for source, scores in zip(comparison.sources, comparison.scores, strict=True):
