@@ -118,6 +118,10 @@ FAILURES = {
             ("rfm-client score a.mp4 --task x", NOBODY),
         )
     },
+    "rfm-client status --url grpcs://localhost:1": (
+        *(3, f"grpcs://localhost:1: no connection: Connection refused: {STARTED}; or name 127.0.0.1: of "),
+        "localhost's addresses, IPv6 and IPv4, gRPC reports the fault of one alone",
+    ),
     "rfm-client evaluate nope": (1, "nope: expected a labelled dataset, got no file or folder of this name"),
     "rfm-client label nope": (1, f"nope: {DATASET} none"),
     "rfm-client label file.txt": (1, f"file.txt: {DATASET} another file"),

@@ -73,6 +73,7 @@ _START = (
     "start the server there (rfm serve), or give the URL of one that runs (with TLS: grpcs:// or https://; without: "
     "grpc:// or http://)"
 )
+_ONE_ADDRESS = "; or name 127.0.0.1: of localhost's addresses, IPv6 and IPv4, gRPC reports the fault of one alone"
 _GRPC_PORT = "give that port, or http:// for the HTTP port, or grpcs:// with TLS"
 _NAME = "give the checkpoint's name with model (--model)"
 _SHOW_KEY = "none was shown, or another: show the key that it wants with api_key (--api-key-file) or headers"
@@ -188,6 +189,8 @@ def unreachable(url: str, reason: str) -> errors.ServerUnavailableError:
     reason, remedy = (found[1] if found else reason), _START
     if url.startswith("grpc://") and _NO_GRPC.search(reason):
         reason, remedy = "no answer of Triton's gRPC port (by default 8001)", _GRPC_PORT
+    if url.startswith("grpcs://localhost:"):
+        remedy += _ONE_ADDRESS
     if grpc_proxy(url):
         remedy += "; or add the host to no_proxy, unless this proxy leads to it"
     return _with_remedy(errors.ServerUnavailableError, f"{with_proxy(url)}: no connection: {reason}", remedy)
