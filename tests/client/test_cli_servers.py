@@ -211,7 +211,7 @@ def test_wait_returns_when_the_model_is_ready_or_its_time_is_up(engines: EngineS
     url = free_url()
     result = invoke("wait", "--url", url, "--timeout", 0.2)
     assert result.exit_code == ExitCode.DEADLINE
-    remedy = "start a server there (rfm serve), or wait longer (--timeout)"
+    remedy = "start a server there (rfm serve), name a model that it serves (--model), or wait longer (--timeout)"
     assert (
         result.stderr
         == f"rfm-client: {url}: rfm and rfm_frames: not ready within 0.2 s: {url}: no connection: Connection refused: {remedy}\n"

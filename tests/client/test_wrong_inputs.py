@@ -95,6 +95,7 @@ USAGE = {
     f"rfm-client gateway --triton {NOBODY} --dataset nope": bad("--dataset", f"nope: {DATASET} none"),
     "rfm-client label dataset --override-task": "Invalid value: --override-task needs --task",
     "rfm score a.mp4": "No such command 'score': that is `rfm-client score`",
+    "rfm try a.mp4 --task N/A": bad("--task", "expected a sentence, got 'N/A'"),
     "rfm serve": "Invalid value: give FOLDER, CHECKPOINT or --repository",
     "rfm serve repository --as topreward": ("Invalid value: --as decides an export, but repository names a repository"),
     "rfm serve org/name --checkpoint org/other": "Invalid value: give CHECKPOINT or --checkpoint, not both",
@@ -147,6 +148,7 @@ FAILURES = {
     "rfm export file.txt --repository out": (1, f"{SOURCE} the file file.txt; name its folder, ."),
     "rfm export empty --repository out --name 'a b'": (1, "--name: expected letters, digits, _ and -, got 'a b'"),
     f"rfm models list --url {NOBODY}": (1, f"{NOBODY}: no connection: Connection refused: {STARTED}"),
+    "rfm try empty --task x": (1, "video: expected a video file, got a folder: name the videos in it (empty)"),
     "rfm try nope.mp4 --task x": (1, "video: expected a video file, got none (nope.mp4)"),
 }
 
@@ -157,6 +159,13 @@ AT_SERVER = {
     "score grey.npy --task x": (
         *(1, "grey.npy: frames: expected uint8 or float in 0..1 [T, H, W, 3] or [T, 3, H, W], got uint8 [4, 32, 32] "),
         "(grey.npy)",
+    ),
+    "score clip.npy --task x --model rfm_frames": (
+        *(
+            5,
+            "clip.npy: Request for unknown model: 'rfm_frames_frames' is not found; served: rfm, rfm_encoder, rfm_frames",
+        ),
+        ": give the checkpoint's name with model (--model)",
     ),
     "score clip.npy": (1, "clip.npy: ", NO_TASK),
     "score clip.npy --task N/A": (1, "clip.npy: ", NO_TASK.replace("none", "'N/A'")),
