@@ -264,7 +264,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
     async def _why_unready(self) -> str:
         try:
             await self._servers.model_info(frames_name(self.model), Deadline(PROBE_TIMEOUT_S))
-        except ServerUnavailableError as error:
+        except (ServerUnavailableError, ModelNotFoundError) as error:  # waiting is the remedy
             return f": {error.fault or error}"
         except RewardError as error:
             return f": {error}"

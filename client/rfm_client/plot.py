@@ -56,6 +56,7 @@ _SUCCESS_IN = 0.7
 _LINE_IN = 0.15  # one text line
 _LONGEST = 44  # characters that fit in a one-column legend
 _SHORT = 20  # characters that let two names fit side by side
+_DOTS = 8  # on a long curve, about
 _LINES = ("-", "--", "-.", ":")
 
 
@@ -109,11 +110,13 @@ def plot_scores(
                 if score not in ("success", result.leading):
                     continue
                 colour, line = colours[number % len(colours)], _LINES[number // len(colours)]
-                marker = "o" if len(x) == 1 else ""  # a single point draws no line
+                step = max(len(results), len(x) // _DOTS)
+                first = number * step // len(results) % len(x)  # staggered dots tell equal curves apart
+                style = {"color": colour, "linestyle": line, "marker": "o", "markevery": (first, step)}
                 label = _shortened(names[number]) if score == result.leading else None
                 values = getattr(result, score)
                 known = ~np.isnan(values)  # the line skips frames without an answer
-                ax.plot(x[known], values[known], color=colour, linestyle=line, marker=marker, label=label)
+                ax.plot(x[known], values[known], label=label, clip_on=False, **style)
             about = FRAME_SCORES[score]
             ax.set_ylabel(about.title(score))
             if None not in about.bounds:

@@ -16,6 +16,7 @@ from rfm_client import RewardClient, Trajectory
 from rfm_client.cli.command import OptionValues, with_options
 from rfm_client.cli.options import FrameRate
 from rfm_client.cli.show import PAGE_PORT, PAGE_URL, command, next_steps, scores_table
+from rfm_client.contract.checks import is_blank
 from rfm_client.contract.description import PUBLIC_CHECKPOINT, ModelInfo
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.contract.wire import frames_name
@@ -45,6 +46,8 @@ def try_video(
         from rfm_client.frames.video import read_video
     except ImportError as error:
         fail(f'it needs {error.name}: pip install ".[demo,encoders,vlm,triton]"')
+    if is_blank(task):
+        raise typer.BadParameter(f"expected a sentence, got {task!r}", param_hint="'--task'")
     settings = ExportConfig(**given)
     with stopped_by_signals():
         frames = read_video(video, rate.fps)

@@ -194,7 +194,7 @@ def test_a_server_that_does_not_answer_is_out_of_time(command: str) -> None:
 
 
 def test_scoring_with_a_model_that_is_not_served_fails_and_names_it(engines: EngineServer, video: Path) -> None:
-    result = ask(engines, "score", "video.mp4", model="unknown")
+    result = ask(engines, "score", "video.mp4", "--task", clip.TASK, model="unknown")
     assert result.exit_code == ExitCode.NO_MODEL
     assert re.fullmatch(r"rfm-client: .*unknown_frames.*; served: .*: give the .* \(--model\)\n", result.stderr)
     result = ask(engines, "score", video, "--task", clip.TASK, model="c1_t1_disc10")  # which reads embeddings alone
@@ -211,7 +211,7 @@ def test_wait_returns_when_the_model_is_ready_or_its_time_is_up(engines: EngineS
     url = free_url()
     result = invoke("wait", "--url", url, "--timeout", 0.2)
     assert result.exit_code == ExitCode.DEADLINE
-    remedy = "start a server there (rfm serve), or wait longer (--timeout)"
+    remedy = "start a server there (rfm serve), name a model that it serves (--model), or wait longer (--timeout)"
     assert (
         result.stderr
         == f"rfm-client: {url}: rfm and rfm_frames: not ready within 0.2 s: {url}: no connection: Connection refused: {remedy}\n"
@@ -220,7 +220,7 @@ def test_wait_returns_when_the_model_is_ready_or_its_time_is_up(engines: EngineS
 
 def test_an_interrupt_ends_it_without_a_traceback() -> None:
     with silent_server() as (url, listening):
-        command = [str(RFM_CLIENT), "score", "video.mp4", "--url", url]
+        command = [str(RFM_CLIENT), "score", "video.mp4", "--task", "x", "--url", url]
         process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         connection, _ = listening.accept()  # by now it is asking
         with connection:

@@ -56,6 +56,8 @@ def bad(option: str, problem: str) -> str:
 USAGE = {
     "rfm-client score": "Missing argument 'VIDEO...'.",
     "rfm-client score a.mp4 --tsk x": "No such option: --tsk (Possible options: --fps, --task)",
+    "rfm-client score a.mp4": bad("--task", "expected a sentence, got none"),
+    "rfm-client compare a.mp4 b.npz --task N/A": bad("--task", "expected a sentence, got 'N/A'"),
     "rfm-client score a.mp4 --fps zero": bad("--fps", "expected a number, got 'zero'"),
     "rfm-client score a.mp4 --fps 0": bad("--fps", "expected at least 0.001, got 0.0"),
     "rfm-client score a.mp4 --fps nan": bad("--fps", "expected a finite number, got nan"),
@@ -65,7 +67,7 @@ USAGE = {
     "rfm-client score a.mp4 --plot nowhere/a.png": bad(
         "--plot", "expected a folder at nowhere, got none: mkdir -p nowhere"
     ),
-    "rfm-client score a.mp4 --url localhost:8001": bad("--url", f"{URL} 'localhost:8001'"),
+    "rfm-client score a.mp4 --task x --url localhost:8001": bad("--url", f"{URL} 'localhost:8001'"),
     "rfm-client score a.mp4 --ca-file key.pem": bad(
         "--ca-file", "expected certificates (PEM) at key.pem, got a file without certificate"
     ),
@@ -93,6 +95,7 @@ USAGE = {
     f"rfm-client gateway --triton {NOBODY} --dataset nope": bad("--dataset", f"nope: {DATASET} none"),
     "rfm-client label dataset --override-task": "Invalid value: --override-task needs --task",
     "rfm score a.mp4": "No such command 'score': that is `rfm-client score`",
+    "rfm try a.mp4 --task N/A": bad("--task", "expected a sentence, got 'N/A'"),
     "rfm serve": "Invalid value: give FOLDER, CHECKPOINT or --repository",
     "rfm serve repository --as topreward": ("Invalid value: --as decides an export, but repository names a repository"),
     "rfm serve org/name --checkpoint org/other": "Invalid value: give CHECKPOINT or --checkpoint, not both",
@@ -113,9 +116,13 @@ FAILURES = {
         f"{command} --url {url}": (3, f"{url}: no connection: Connection refused: {STARTED}")
         for command, url in (
             *(("rfm-client status", NOBODY), ("rfm-client status", "http://localhost:1")),
-            ("rfm-client score a.mp4", NOBODY),
+            ("rfm-client score a.mp4 --task x", NOBODY),
         )
     },
+    "rfm-client status --url grpcs://localhost:1": (
+        *(3, f"grpcs://localhost:1: no connection: Connection refused: {STARTED}; or name 127.0.0.1: of "),
+        "localhost's addresses, IPv6 and IPv4, gRPC reports the fault of one alone",
+    ),
     "rfm-client evaluate nope": (1, "nope: expected a labelled dataset, got no file or folder of this name"),
     "rfm-client label nope": (1, f"nope: {DATASET} none"),
     "rfm-client label file.txt": (1, f"file.txt: {DATASET} another file"),
@@ -141,6 +148,7 @@ FAILURES = {
     "rfm export file.txt --repository out": (1, f"{SOURCE} the file file.txt; name its folder, ."),
     "rfm export empty --repository out --name 'a b'": (1, "--name: expected letters, digits, _ and -, got 'a b'"),
     f"rfm models list --url {NOBODY}": (1, f"{NOBODY}: no connection: Connection refused: {STARTED}"),
+    "rfm try empty --task x": (1, "video: expected a video file, got a folder: name the videos in it (empty)"),
     "rfm try nope.mp4 --task x": (1, "video: expected a video file, got none (nope.mp4)"),
 }
 
@@ -151,6 +159,13 @@ AT_SERVER = {
     "score grey.npy --task x": (
         *(1, "grey.npy: frames: expected uint8 or float in 0..1 [T, H, W, 3] or [T, 3, H, W], got uint8 [4, 32, 32] "),
         "(grey.npy)",
+    ),
+    "score clip.npy --task x --model rfm_frames": (
+        *(
+            5,
+            "clip.npy: Request for unknown model: 'rfm_frames_frames' is not found; served: rfm, rfm_encoder, rfm_frames",
+        ),
+        ": give the checkpoint's name with model (--model)",
     ),
     "score clip.npy": (1, "clip.npy: ", NO_TASK),
     "score clip.npy --task N/A": (1, "clip.npy: ", NO_TASK.replace("none", "'N/A'")),

@@ -299,6 +299,7 @@ def test_no_number_is_cut_on_a_terminal_and_episodes_without_an_outcome_are_left
     document = json.loads((tmp_path / "out.json").read_text())
     assert (document["episodes"], document["num_without_outcome"]) == ([0, 1, 3, 4], 1)
     assert document["without_labels"] == [9, "gone.mp4"]
+    assert [f"rfm-client: note: {note}" for note in document["notes"]] == done.stderr.splitlines() != []
     assert max(map(len, shown.partition("VOC: ")[0].splitlines())) <= 80
     for name, found in zip(
         ("a_", r"b\b"), evaluate_labels(files, read_outcomes(outcomes, names=NAMES)).evaluations, strict=True

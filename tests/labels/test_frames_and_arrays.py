@@ -144,6 +144,8 @@ def test_a_folder_of_hdf5_files_is_labelled_file_by_file(tmp_path: Path, capsys:
     assert (code, tasks) == (ExitCode.OK, {"a", "b", "c"})
     files = [f"{root}/more/task_1.h5", f"{root}/task_2.hdf5", f"{root}/task_10.hdf5"]
     assert [line for line in said if line in files] == files
+    (cameras,) = [line for line in said if line.startswith("note: cameras: ")]
+    assert f"note: 3 of 3 files: {cameras.removeprefix('note: ')}" in said
     for folder, stem in (("more", "task_1"), ("", "task_2"), ("", "task_10")):
         labels = read_episode_labels(root / folder / f"{stem}.rfm_progress.parquet", 0)
         assert labels is not None

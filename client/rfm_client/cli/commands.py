@@ -145,6 +145,7 @@ def compare(
     if len(videos) < MIN_COMPARED:
         raise typer.BadParameter(f"expected at least {MIN_COMPARED} videos, got {len(videos)}", param_hint="VIDEO")
     output.begin()
+    video.begin(videos)
     with server.connected() as client:
         comparison = comparing.compare(client, videos, video)
     for source, scores in zip(comparison.sources, comparison.scores, strict=True):
@@ -198,7 +199,8 @@ def wait(server: WaitOptions) -> None:
         with server.client() as client:
             client.wait_ready(server.timeout_s)
     except DeadlineExceededError as error:
-        raise DeadlineExceededError(f"{error}: start a server there (rfm serve), or wait longer (--timeout)") from None
+        remedy = "start a server there (rfm serve), name a model that it serves (--model), or wait longer (--timeout)"
+        raise DeadlineExceededError(f"{error}: {remedy}") from None
     typer.echo(f"ready after {time.monotonic() - started_s:.1f} s")
 
 

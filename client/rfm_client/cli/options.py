@@ -19,12 +19,13 @@ import typer
 from rfm_client.async_client import DEFAULT_TIMEOUT_S
 from rfm_client.cli.command import STANDARD_OUTPUT, usage_errors
 from rfm_client.client import RewardClient
-from rfm_client.contract.checks import require
+from rfm_client.contract.checks import is_blank, require
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import InvalidSampleError, InvalidValueError, ModelNotFoundError, RewardError
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, random_trajectory
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
 from rfm_client.contract.wire import DEFAULT_MODEL
+from rfm_client.frames.inputs import ARRAY_SUFFIXES
 from rfm_client.frames.orientation import ChannelOrder, Orientation
 from rfm_client.frames.sampling import RULES, Rule, Sampling
 from rfm_client.plot import MAX_CURVES, Size
@@ -166,6 +167,11 @@ class VideoOptions(FrameRate):
         """Arguments for ``load_trajectory`` that only some models read."""
         return {name: getattr(self, name) for name in self.settings() if name not in VideoOptions.settings()}
 
+    def begin(self, videos: Sequence[str]) -> None:
+        """Raise ConfigError if videos lack a task, which only files of arrays may have."""
+        if is_blank(self.task) and not all(video.lower().endswith(ARRAY_SUFFIXES) for video in videos):
+            raise ConfigError.at("task", "a sentence", repr(self.task) if self.task else "none")
+
 
 @dataclass(frozen=True)
 class ScoredVideos(VideoOptions):
@@ -182,7 +188,8 @@ class ScoredVideos(VideoOptions):
     goal: str | None = setting(None, "Picture of the task done, for Robo-Dopamine.", metavar="IMAGE")
 
     def begin(self, videos: Sequence[str]) -> None:
-        """Raise ConfigError if views come with more than one video."""
+        """Raise ConfigError if videos lack a task, or if views come with more than one video."""
+        super().begin(videos)
         if self.views and len(videos) > 1:
             raise ConfigError.at("views", "a single VIDEO, of which they are views", len(videos))
 

@@ -225,7 +225,9 @@ def _draw_curves(axes: Axes, panel: Panel, height_in: float) -> None:
         else:
             label, known = FRAME_SCORES[name].title(name), ~np.isnan(scores)
             positions = np.asarray(panel.positions)[known]
-            handles += own.plot(positions, scores[known], color=COLOURS[name], marker="o", label=label, clip_on=False)
+            size = 3 if name == "success" else 5  # a dot of progress shows behind an equal one of success
+            style: dict[str, Any] = {"color": COLOURS[name], "marker": "o", "markersize": size}
+            handles += own.plot(positions, scores[known], label=label, clip_on=False, **style)
             if name == "success":
                 label = f"threshold {SUCCESS_THRESHOLD}"
                 handles.append(own.axhline(SUCCESS_THRESHOLD, **THRESHOLD, label=label))

@@ -30,7 +30,9 @@ from rfm_client.contract.errors import (
 )
 from rfm_client.contract.results import FrameScores, ProgressResult
 from rfm_client.contract.samples import Trajectory
+from rfm_client.frames.inputs import ARRAY_SUFFIXES, load_trajectory
 from rfm_client.frames.sampling import Sampling
+from rfm_client.frames.video import frame_times_s
 from rfm_client.recording import Recording
 from rfm_client.scoring.samples import CallOptions
 
@@ -52,9 +54,6 @@ class Source:
     @classmethod
     def read(cls, name: str, video: VideoOptions) -> Source:
         """Read the source from a file. Raises InvalidSampleError."""
-        from rfm_client.frames.inputs import ARRAY_SUFFIXES, load_trajectory
-        from rfm_client.frames.video import frame_times_s
-
         are_arrays = PurePath(name).suffix.lower() in ARRAY_SUFFIXES
         fps = None if are_arrays else video.fps
         trajectory = load_trajectory(

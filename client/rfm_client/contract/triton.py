@@ -14,7 +14,7 @@ from typing import Any, TypeAlias, TypeVar
 
 from rfm_client.contract import errors
 from rfm_client.contract.addresses import grpc_proxy, with_proxy
-from rfm_client.contract.wire import GOAL, NUM_FRAMES, VIEWS, frames_name
+from rfm_client.contract.wire import GOAL, NUM_FRAMES, VIEWS, encoder_name, frames_name
 
 BadRequest: TypeAlias = Callable[[str], errors.RewardError]
 
@@ -73,8 +73,10 @@ _START = (
     "start the server there (rfm serve), or give the URL of one that runs (with TLS: grpcs:// or https://; without: "
     "grpc:// or http://)"
 )
+_ONE_ADDRESS = "; or name 127.0.0.1: of localhost's addresses, IPv6 and IPv4, gRPC reports the fault of one alone"
 _GRPC_PORT = "give that port, or http:// for the HTTP port, or grpcs:// with TLS"
 _NAME = "give the checkpoint's name with model (--model)"
+_OF_PARTS = frames_name(frames_name("")), frames_name(encoder_name(""))  # ask for frames of NAME_frames, NAME_encoder
 _SHOW_KEY = "none was shown, or another: show the key that it wants with api_key (--api-key-file) or headers"
 _TRUST = {
     "WRONG_VERSION_NUMBER": "use grpc:// or http:// for a server without TLS",
@@ -183,6 +185,8 @@ def unreachable(url: str, reason: str) -> errors.ServerUnavailableError:
     reason, remedy = (found[1] if found else reason), _START
     if url.startswith("grpc://") and _NO_GRPC.search(reason):
         reason, remedy = "no answer of Triton's gRPC port (by default 8001)", _GRPC_PORT
+    if url.startswith("grpcs://localhost:"):
+        remedy += _ONE_ADDRESS
     if grpc_proxy(url):
         remedy += "; or add the host to no_proxy, unless this proxy leads to it"
     return _with_remedy(errors.ServerUnavailableError, f"{with_proxy(url)}: no connection: {reason}", remedy)
@@ -193,7 +197,7 @@ def not_served(model: str, message: str, served: Collection[str]) -> errors.Mode
     remedy = _NAME
     if frames_name(model) in served:
         remedy = "this checkpoint takes no embeddings: give frames, and ask model_info(frames=True)"
-    elif model in map(frames_name, served):
+    elif model in map(frames_name, served) and not model.endswith(_OF_PARTS):
         remedy = "this checkpoint takes embeddings alone: export it with --image-encoder and --text-encoder"
     names = ", ".join(sorted(served)) or "none"
     return _with_remedy(errors.ModelNotFoundError, f"{message}; served: {names}", remedy)

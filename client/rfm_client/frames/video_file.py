@@ -69,8 +69,9 @@ class Video:
         try:
             with self.file.open("rb") as opened:
                 return read_packets(opened, self.container)
-        except FileNotFoundError as error:
-            raise FrameFileError.of("a video file", "none") from error
+        except (FileNotFoundError, IsADirectoryError) as error:
+            got = "a folder: name the videos in it" if self.file.is_dir() else "none"
+            raise FrameFileError.of("a video file", got) from error
         except import_av().InvalidDataError as error:
             raise FrameFileError.of("a file with a video stream", "a file of another kind, or a damaged one") from error
         except (import_av().FFmpegError, OSError) as error:

@@ -120,4 +120,4 @@ def document(comparison: LabelComparison) -> dict[str, Any]:
     is_success = comparison.is_success
     evaluations = [{**asdict(each), "final_progress": each.final_progress.tolist()} for each in comparison.evaluations]
     arrays = {"is_success": None if is_success is None else is_success.tolist(), "evaluations": evaluations}
-    return asdict(comparison) | arrays
+    return asdict(comparison) | arrays | {"notes": comparison.notes}

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias, get_args
@@ -34,6 +35,7 @@ from rfm_labels.scorer import ClientScorer, Scorer
 from rfm_labels.summary import summarise
 from rfm_labels.writing import remove_files
 
+NOTE = "note: "  # a note of several files is said once
 SPEED_OVER_S = 600.0  # an episode may take minutes
 Printer: TypeAlias = Callable[[str], None]
 _CAMERA_OPTIONS = ("orient", "channels")  # options with a value per camera
@@ -85,7 +87,7 @@ class ProgressBar(Watch):
     def note(self, text: str) -> None:
         """Write the text on a line."""
         self.notes.append(text)
-        self._say(f"note: {text}")
+        self._say(NOTE + text)
 
     def downloading(self, num_files: int, num_bytes: int) -> None:
         """Write how much is downloaded. Raises ConfigError, or typer.Abort after a "no", for a large download."""
@@ -303,17 +305,31 @@ class LabelCommand:
         if self.options.remove:
             self._remove(commands)
             return ExitCode.OK
-        codes = []
+        codes, notes = [], Counter[str]()
+
+        def say_once(line: str) -> None:
+            is_note = line.startswith(NOTE)
+            notes[line] += is_note
+            if not is_note or notes[line] == 1:
+                self.say(line)
+
         reads_frames = not (self.options.report or self.options.list_labels)
-        for command in self._checked(commands) if reads_frames else commands:
-            self.say(f"{command.source}")
-            try:
-                codes.append(command.run())
-            except DatasetError as error:
-                if not self.options.report:
-                    raise
-                self.say(f"{error}")  # no labels there; others may have some
-                codes.append(ExitCode.FAILED)
+        commands = self._checked(commands) if reads_frames else commands
+        shared = reads_frames and self.options.engine == "threads"  # Ray's actors connect by themselves
+        with self.connect() if shared else nullcontext() as scorer:
+            connect = self.connect if scorer is None else lambda: nullcontext(scorer)
+            for command in commands:
+                self.say(f"{command.source}")
+                try:
+                    codes.append(replace(command, say=say_once, connect=connect).run())
+                except DatasetError as error:
+                    if not self.options.report:
+                        raise
+                    self.say(f"{error}")  # no labels there; others may have some
+                    codes.append(ExitCode.FAILED)
+        for line, count in notes.items():
+            if count > 1:
+                self.say(f"{NOTE}{count} of {len(files)} files: {line.removeprefix(NOTE)}")
         return next((code for code in codes if code is not ExitCode.OK), ExitCode.OK)
 
     def _checked(self, commands: Sequence[LabelCommand]) -> list[LabelCommand]:
@@ -410,7 +426,7 @@ class LabelCommand:
                 raise DatasetError.at(outputs.folder, expected, repr(self.labels.name))
         summary = summarise(path)
         for line in blank_lines(read_blank(path), len(summary.episodes)):
-            self.say(f"note: {line}")
+            self.say(NOTE + line)
         print_facts(summary.rows())
 
     def _outputs(self, labels: LabelOptions) -> Outputs:
