@@ -514,7 +514,7 @@ function update() {
   told();
   showWhetherReady();
   page.scored.textContent = curves.length ? howMany() : "";
-  page["scored-by"].textContent = scored.length ? `by ${[...new Set(curves.map(checkpointOf))].join(", ")}` : "";
+  page["scored-by"].textContent = scored.length ? `· ${[...new Set(curves.map(checkpointOf))].join(", ")}` : "";
   page.chart.setAttribute("aria-label", scored.length
     ? scored.map((curve) => `${curve.label}: final ${toldAt(curve, -1)}`).join("; ")
     : "No curves yet.");
