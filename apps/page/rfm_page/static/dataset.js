@@ -41,7 +41,7 @@ export class DatasetTab {
   #episodes = []; // as the threshold judges them
   #shown = []; // those that are kept, in their order
   #chosen = new Set(); // numbers of the episodes that are selected
-  #outcomes = new Map(); // "success" or "failure" by name or number of an episode: what somebody has marked
+  #outcomes = new Map(); // "success" or "failure", as somebody has marked an episode, by `markOf`
   #isTurned = false; // the order is the other way round
   #words = "";
   #watched = null;
@@ -72,7 +72,7 @@ export class DatasetTab {
       onWatch: (episode) => { this.#watch(episode); this.#onShown(true); },
       chosen: this.#chosen,
       onChoose: () => this.#showChosen(),
-      outcomeOf: (episode) => this.#outcomes.get(idOf(episode)),
+      outcomeOf: (episode) => this.#outcomes.get(markOf(episode)),
     });
     const elements = {
       videos: page["episode-videos"], chart: page["episode-chart"], motion: page["motion-chart"], slider: page["episode-time"],
@@ -422,16 +422,16 @@ export class DatasetTab {
 
   /** The episodes of this dataset that are marked, and their outcomes. */
   get #marked() {
-    return this.#told.episodes.map(idOf).filter((id) => this.#outcomes.has(id)).map((id) => [id, this.#outcomes.get(id)]);
+    return this.#told.episodes.map((each) => [idOf(each), this.#outcomes.get(markOf(each))]).filter(([, outcome]) => outcome);
   }
 
   /** Marks the watched episode, for as long as the browser remembers; takes the same mark away. */
   #mark(outcome) {
-    const id = idOf(this.#watched);
-    const isMarked = this.#outcomes.get(id) === outcome;
+    const mark = markOf(this.#watched);
+    const isMarked = this.#outcomes.get(mark) === outcome;
     this.#readOutcomes(this.#outcomes); // another window may have marked some since
-    if (isMarked) this.#outcomes.delete(id);
-    else this.#outcomes.set(id, outcome);
+    if (isMarked) this.#outcomes.delete(mark);
+    else this.#outcomes.set(mark, outcome);
     remember(this.#remembersAs, JSON.stringify([...this.#outcomes]));
     this.#table.mark(this.#watched.episode, this.#shown);
     this.#showOutcomes();
@@ -439,7 +439,7 @@ export class DatasetTab {
 
   #showOutcomes() {
     const [page, { length }] = [this.#page, this.#marked];
-    const outcome = this.#watched && this.#outcomes.get(idOf(this.#watched));
+    const outcome = this.#watched && this.#outcomes.get(markOf(this.#watched));
     page.succeeded.setAttribute("aria-pressed", outcome === "success");
     page.failed.setAttribute("aria-pressed", outcome === "failure");
     page.outcomes.textContent = `outcomes.csv (${length} marked)`;
@@ -638,6 +638,11 @@ function describe(curves) {
 /** What an episode is called in a file of outcomes: its name, if it has one, since the numbers of a folder change. */
 function idOf({ name, episode }) {
   return name ?? episode;
+}
+
+/** What marks of an episode are kept under. One that was recorded again seldom has as many frames. */
+function markOf(episode) {
+  return `${idOf(episode)}, ${episode.num_frames} frames`;
 }
 
 function element(name, text) {
