@@ -541,7 +541,7 @@ function modelOf({ model }) {
 
 /** The settings belong to the tabs that have some, and what is said of curves to the first. */
 function shownTab(index) {
-  page.fold.disabled = index === 2 || (index === 1 && page["dataset-side"].hidden);
+  page.fold.disabled = index === 1 && page["dataset-side"].hidden;
   page.status.textContent = "";
   const isStep = index !== shownIndex;
   if (isStep) address.settle(); // of the tab that was shown
