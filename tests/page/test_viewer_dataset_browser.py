@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import shlex
@@ -11,9 +12,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from PIL import Image
 from pyarrow import parquet
 from selenium.webdriver import ActionChains, Keys
 from selenium.webdriver.support.select import Select
@@ -38,6 +41,7 @@ OTHER = "brightness"  # the second reward of the first dataset
 NUM_LARGE = 10_000
 DEMO, PLAIN, BRIGHT, LARGE, CLIPS = range(5)  # labelled by the demo, not, by brightness, by chance, and by the demo
 VIDEOS = "#episode-videos video"
+SVG = "{http://www.w3.org/2000/svg}"
 PLAYERS = f"{VIDEOS}, #episode-time"  # the videos, then the slider
 BEYOND = """
 return [document.documentElement, ...document.querySelectorAll(".work")].map((each) => each.scrollWidth - each.clientWidth);
@@ -212,8 +216,10 @@ def test_filters_keep_the_matching_episodes_and_show_their_number(page: Page) ->
     dataset = page.choose(DEMO)
     summary = summarise(page.folders[DEMO] / "rfm_progress.parquet")
     assert summary.best_success is not None and summary.disagreement is not None
+    assert summary.voted_success is not None
     succeeds = summary.best_success >= 0.5
     expected = {
+        "succeed": (None, summary.voted_success >= 0.5),
         "never": (None, ~succeeds),
         "low": (0.992, succeeds & (summary.final_progress < 0.992)),
         "backwards": (7.5, 100 * summary.backwards >= 7.5),
@@ -265,7 +271,7 @@ def test_selected_episodes_are_taken_along(page: Page) -> None:
 
 
 def test_two_label_files_are_overlaid_and_their_differences_listed(page: Page) -> None:
-    page.choose(DEMO)
+    dataset = page.choose(DEMO)
     assert [each.text for each in Select(page.browser["others"]).options] == ["none", f"{OTHER}_progress.parquet"]
     Select(page.browser["others"]).select_by_visible_text(f"{OTHER}_progress.parquet")
     page.browser.until("document.getElementById('filter-differ').hidden === false")
@@ -295,6 +301,55 @@ def test_two_label_files_are_overlaid_and_their_differences_listed(page: Page) -
         columns_of(page.folders[DEMO], 2, f"{name}_progress.parquet")["progress_sparse"][0] for name in ("rfm", OTHER)
     ]
     np.testing.assert_allclose([page.numbers[0][0], page.numbers[3][0]], expected, rtol=0, atol=SHOWN)
+    page.browser["episode-png"].click()
+    assert Image.open(io.BytesIO(page.browser.saved("episode_2.png"))).width == 2100
+    page.browser["episode-svg"].click()
+    svg = ElementTree.fromstring(page.browser.saved("episode_2.svg"))
+    titles = [dataset.episodes[2].task, "toy_v30_many, episode 2", TOY]
+    told = [text for element in svg.iter(f"{SVG}text") if (text := element.text) in [*titles, *names]]
+    assert told == [*titles, *names]
+    assert len(list(svg.iter(f"{SVG}polyline"))) == len([text for pair in page.numbers for text in pair])
+
+
+def test_marked_outcomes_stay_and_evaluate_reads_them(page: Page) -> None:
+    browser = page.browser
+
+    def evaluated(link: str, *lines: str) -> tuple[list[int], list[bool]]:
+        """Save the outcomes after a reload, and return the episodes and outcomes that evaluate reads."""
+        page.open_link(link)
+        browser.until(f"document.getElementById('outcomes').textContent === 'outcomes.csv ({len(lines)} marked)'")
+        browser["outcomes"].click()
+        content = browser.saved("outcomes.csv")
+        assert content.decode().splitlines() == ["episode,success", *lines]
+        root = page.folders[CLIPS if "clips" in link else DEMO]
+        (root.parent / "outcomes.csv").write_bytes(content)
+        run_line(root.parent, f"rfm-client evaluate {root.name} --outcome outcomes.csv --json marked.json")
+        told = json.loads((root.parent / "marked.json").read_text())
+        return told["episodes"], told["is_success"]
+
+    def watch_clip(name: str) -> None:
+        browser.run(f"document.querySelector('#episodes tr:has([title^=\"{name}\"]) button').click()")
+        browser.until(f"document.getElementById('episode-told').textContent.startsWith('{name}')")
+
+    page.choose(DEMO)
+    assert not browser["outcomes"].is_enabled()
+    for episode, name in ((7, "succeeded"), (2, "failed"), (3, "failed")):
+        page.watch(episode)
+        assert browser[name].get_attribute("aria-pressed") == "false"
+        browser[name].click()
+        assert browser[name].get_attribute("aria-pressed") == "true"
+    browser["failed"].click()  # no mark again
+    marked = "return [...document.querySelectorAll('#episodes [data-outcome]')].filter((each) => each.dataset.outcome)"
+    labels = sorted(browser.run(f"{marked}.map((each) => each.ariaLabel)"))
+    assert labels == ["Watch episode 2, marked as a failure", "Watch episode 7, marked as a success"]
+    assert evaluated(FIRST, "2,failure", "7,success") == ([2, 7], [False, True])
+    link = "#tab=dataset&dataset=clips"
+    page.open_link(link)
+    browser.until("document.querySelector('#episodes tr [title^=\"failure.mp4\"]')")
+    for name, key in (("failure.mp4", "s"), ("failure.mp4", "f"), ("success.mp4", "s")):
+        watch_clip(name)
+        ActionChains(browser.driver).send_keys(key).perform()
+    assert evaluated(link, "failure.mp4,failure", "success.mp4,success") == ([0, 2], [False, True])
 
 
 def test_ten_thousand_episodes_are_a_few_rows_of_the_document(page: Page) -> None:
@@ -553,6 +608,7 @@ def test_each_tab_opened_fresh_on_a_phone_shows_its_content_and_no_settings(page
         browser.all("#examples > button")[0].click()
         browser.until_text("scored", "3 of 3 scored")
         assert not browser["question"].is_displayed()  # it makes way for the curves
+        assert browser["compare"].is_displayed()
         browser.draw()
         assert browser.run(UNSEEN, "#videos .nameable button", "figcaption") == []
         assert browser.run(IN_VIEW, ["videos"])[0] > 0

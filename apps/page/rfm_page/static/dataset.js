@@ -5,11 +5,13 @@ import { curvesOf, datasets, episodesOf, faultsOf, missingOf, previewOf, videoOf
 import { Asking } from "./asking.js";
 import { EpisodeTable, FILTER_NAMES, judged, kept, PLAIN_ORDER, sorted, toldOf, UNDONE, WORST_FIRST } from "./episodes.js";
 import { deadLink, downloading, failure, noDataset, noEpisode, noHit, noLabels, noVideo } from "./faults.js";
-import { episodesJson, episodesText, lerobotWords } from "./exports.js";
+import { episodesJson, episodesText, lerobotWords, outcomesCsv } from "./exports.js";
+import { pngFigure, svgFigure } from "./figure.js";
 import { Histogram } from "./histogram.js";
 import { onKeys } from "./keys.js";
 import { DASHES, lookOf, namedLine } from "./looks.js";
 import { Previews } from "./previews.js";
+import { remember, remembered } from "./remembered.js";
 import { Place } from "./states.js";
 import { save } from "./takeaway.js";
 import { cut, NONE, shown } from "./text.js";
@@ -39,6 +41,7 @@ export class DatasetTab {
   #episodes = []; // as the threshold judges them
   #shown = []; // those that are kept, in their order
   #chosen = new Set(); // numbers of the episodes that are selected
+  #outcomes = new Map(); // "success" or "failure", as somebody has marked an episode, by `markOf`
   #isTurned = false; // the order is the other way round
   #words = "";
   #watched = null;
@@ -69,6 +72,7 @@ export class DatasetTab {
       onWatch: (episode) => { this.#watch(episode); this.#onShown(true); },
       chosen: this.#chosen,
       onChoose: () => this.#showChosen(),
+      outcomeOf: (episode) => this.#outcomes.get(markOf(episode)),
     });
     const elements = {
       videos: page["episode-videos"], chart: page["episode-chart"], motion: page["motion-chart"], slider: page["episode-time"],
@@ -107,11 +111,19 @@ export class DatasetTab {
     on("use", "change", () => this.#showChosen());
     on("episodes-text", "click", () => save("episodes.txt", episodesText(this.#taken.map(({ episode }) => episode)), "text/plain"));
     on("episodes-json", "click", () => save("episodes.json", this.#json(), "application/json"));
+    on("outcomes", "click", () => save("outcomes.csv", outcomesCsv(this.#marked), "text/csv"));
+    on("episode-png", "click", async () => save(`episode_${this.#watched.episode}.png`, await pngFigure(this.#figure())));
+    on("episode-svg", "click", () => save(`episode_${this.#watched.episode}.svg`, this.#figure(), "image/svg+xml"));
+    on("succeeded", "click", () => this.#mark("success"));
+    on("failed", "click", () => this.#mark("failure"));
     on("score-episode", "click", () => this.#score());
     on("episode-close", "click", () => this.#close());
     on("episode-before", "click", () => this.#step(-1));
     on("episode-after", "click", () => this.#step(1));
-    const keys = { " ": () => page["episode-play"].click(), n: () => this.#step(1), p: () => this.#step(-1), Escape: () => this.#close() };
+    const keys = {
+      " ": () => page["episode-play"].click(), n: () => this.#step(1), p: () => this.#step(-1), Escape: () => this.#close(),
+      s: () => this.#mark("success"), f: () => this.#mark("failure"),
+    };
     onKeys(keys, () => this.#watched && !page["dataset-panel"].hidden);
   }
 
@@ -275,6 +287,8 @@ export class DatasetTab {
       this.#failed("errors", "The dataset cannot be shown", error, () => this.#load());
     }
     this.#previews.begin();
+    this.#readOutcomes();
+    this.#showOutcomes();
     page.cutoff.value = this.#told.threshold;
     page.order.value = this.#usualOrder;
     this.#isTurned = false;
@@ -398,6 +412,40 @@ export class DatasetTab {
     return episodesJson(about, this.#taken);
   }
 
+  get #remembersAs() {
+    return `rfm.outcomes.${this.#name(this.#number)}`;
+  }
+
+  #readOutcomes(otherwise = []) {
+    this.#outcomes = new Map(JSON.parse(remembered(this.#remembersAs)) ?? otherwise);
+  }
+
+  /** The episodes of this dataset that are marked, and their outcomes. */
+  get #marked() {
+    return this.#told.episodes.map((each) => [idOf(each), this.#outcomes.get(markOf(each))]).filter(([, outcome]) => outcome);
+  }
+
+  /** Marks the watched episode, for as long as the browser remembers; takes the same mark away. */
+  #mark(outcome) {
+    const mark = markOf(this.#watched);
+    const isMarked = this.#outcomes.get(mark) === outcome;
+    this.#readOutcomes(this.#outcomes); // another window may have marked some since
+    if (isMarked) this.#outcomes.delete(mark);
+    else this.#outcomes.set(mark, outcome);
+    remember(this.#remembersAs, JSON.stringify([...this.#outcomes]));
+    this.#table.mark(this.#watched.episode, this.#shown);
+    this.#showOutcomes();
+  }
+
+  #showOutcomes() {
+    const [page, { length }] = [this.#page, this.#marked];
+    const outcome = this.#watched && this.#outcomes.get(markOf(this.#watched));
+    page.succeeded.setAttribute("aria-pressed", outcome === "success");
+    page.failed.setAttribute("aria-pressed", outcome === "failure");
+    page.outcomes.textContent = `outcomes.csv (${length} marked)`;
+    page.outcomes.disabled = !length;
+  }
+
   #showEnds() {
     const labelled = this.#episodes.filter(({ final_progress: final }) => final !== undefined && final !== null);
     const judgedOnes = labelled.filter(({ never_succeeds: never }) => never !== null);
@@ -443,7 +491,7 @@ export class DatasetTab {
     this.#watched = null;
     this.#page.episode.hidden = true;
     this.#page.datasets.classList.remove("watching");
-    this.#page["score-episode"].disabled = true;
+    for (const name of ["score-episode", "episode-png", "episode-svg"]) this.#page[name].disabled = true;
     this.#table.mark(null, []);
   }
 
@@ -471,6 +519,7 @@ export class DatasetTab {
     this.#places.episode.clear();
     this.#places.errors.clear();
     page.episode.hidden = false;
+    this.#showOutcomes();
     page.datasets.classList.add("watching");
     this.#table.mark(episode.episode, this.#shown);
     page["episode-title"].textContent = `Episode ${episode.episode}`;
@@ -518,7 +567,8 @@ export class DatasetTab {
     this.#timeline.show(curves.length ? curves : [emptyCurve(told[0])], motion);
     page["episode-chart"].setAttribute("aria-label", describe(curves));
     page["episode-legend"].replaceChildren(...curves.map(namedLine));
-    this.#watched.fps = told[0].fps;
+    Object.assign(this.#watched, { fps: told[0].fps, curves });
+    page["episode-png"].disabled = page["episode-svg"].disabled = !curves.length;
     const found = await Promise.all(cameras.map((_, camera) => videoOf(this.#number, episode, camera, signal)));
     if (signal.aborted) return;
     if (!cameras.length) this.#places.episode.show(noVideo(() => this.#watch(this.#watched)));
@@ -535,6 +585,14 @@ export class DatasetTab {
         ? "Off: the page encodes these frames for the browser, which changes their scores slightly. Use rfm-client label." : "";
     Object.assign(this.#page["score-episode"], { disabled: reason !== "", title: reason });
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) this.#timeline.videos.play();
+  }
+
+  /** The curves of the watched episode as a figure, whose legend has the names of the cameras. */
+  #figure() {
+    const { curves, episode } = this.#watched;
+    const video = { title: "" }; // of all curves
+    const titles = [toldOf(this.#watched), `${this.#datasets[this.#number].name}, episode ${episode}`, this.#told.warning ?? this.#labels];
+    return svgFigure(this.#page.figure, curves.map((curve) => ({ ...curve, video, task: curve.label })), { titles, threshold: this.#threshold });
   }
 
   #score() {
@@ -575,6 +633,16 @@ function emptyCurve({ times_s: times }) {
 function describe(curves) {
   const told = curves.map(({ label, progress }) => `${label}: final progress ${shown(progress.at(-1))}`);
   return told.length ? told.join("; ") : "This episode has no labels.";
+}
+
+/** What an episode is called in a file of outcomes: its name, if it has one, since the numbers of a folder change. */
+function idOf({ name, episode }) {
+  return name ?? episode;
+}
+
+/** What marks of an episode are kept under. One that was recorded again seldom has as many frames. */
+function markOf(episode) {
+  return `${idOf(episode)}, ${episode.num_frames} frames`;
 }
 
 function element(name, text) {

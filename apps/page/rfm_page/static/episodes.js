@@ -29,6 +29,7 @@ const NAMES = ["", "", "Task", "Frames", "Progress", "Best", "End", "Back", "Cam
 
 /** What a filter keeps, by name; the second argument is the number beside it */
 const FILTERS = {
+  succeed: ({ verdict }) => verdict === SUCCEEDS,
   never: ({ never_succeeds: never }) => never === true,
   low: ({ never_succeeds: never, final_progress: final }, least) => never === false && isKnown(final) && final < least,
   backwards: ({ backwards }, percent) => isKnown(backwards) && 100 * backwards >= percent,
@@ -84,6 +85,7 @@ export function sorted(episodes, order, isTurned) {
 /**
  * A table of episodes. elements: as `VirtualRows` takes them
  * previews: fill the pictures and curves; onWatch(episode): somebody wants to watch one; chosen: the numbers of those that are selected; onChoose(): they are others
+ * outcomeOf(episode): "success" or "failure", as somebody has marked it; undefined: not marked
  */
 export class EpisodeTable {
   #body;
@@ -92,15 +94,17 @@ export class EpisodeTable {
   #previews;
   #chosen;
   #onChoose;
+  #outcomeOf;
   #watched = null;
   #threshold = 0.5;
 
-  constructor(elements, { previews, onWatch, chosen, onChoose }) {
+  constructor(elements, { previews, onWatch, chosen, onChoose, outcomeOf }) {
     this.#body = elements.body;
     this.#previews = previews;
     this.#onWatch = onWatch;
     this.#chosen = chosen;
     this.#onChoose = onChoose;
+    this.#outcomeOf = outcomeOf;
     this.#rows = new VirtualRows(elements, (episode) => this.#row(episode));
   }
 
@@ -135,7 +139,6 @@ export class EpisodeTable {
     header.scope = "row";
     button.type = "button";
     button.textContent = `${episode.episode}`;
-    button.setAttribute("aria-label", `Watch episode ${episode.episode}`);
     header.append(button);
     box.type = "checkbox";
     box.checked = this.#chosen.has(episode.episode);
@@ -177,9 +180,12 @@ export class EpisodeTable {
     return label(row, NAMES);
   }
 
-  #markRow(row, { episode }) {
-    row.classList.toggle("shown", episode === this.#watched);
-    row.querySelector("button").setAttribute("aria-pressed", episode === this.#watched);
+  #markRow(row, episode) {
+    const [button, outcome, isWatched] = [row.querySelector("button"), this.#outcomeOf(episode), episode.episode === this.#watched];
+    row.classList.toggle("shown", isWatched);
+    button.setAttribute("aria-pressed", isWatched);
+    button.setAttribute("aria-label", `Watch episode ${episode.episode}${outcome ? `, marked as a ${outcome}` : ""}`);
+    button.dataset.outcome = outcome ?? "";
   }
 }
 

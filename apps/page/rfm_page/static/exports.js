@@ -2,6 +2,7 @@
 // Episodes of a dataset as other programs take them.
 
 import { commented, quoted } from "./shell.js";
+import { csvText } from "./takeaway.js";
 
 /** One number a line. */
 export function episodesText(numbers) {
@@ -11,6 +12,11 @@ export function episodesText(numbers) {
 /** What is known of the episodes, as JSON. about: dataset, labels and threshold */
 export function episodesJson(about, episodes) {
   return JSON.stringify({ ...about, episodes }, null, 2) + "\n";
+}
+
+/** Outcomes as `rfm-client evaluate` reads them. marked: [name or number, outcome] of each episode */
+export function outcomesCsv(marked) {
+  return csvText([["episode", "success"], ...marked]);
 }
 
 /** By name: what LeRobot is to do with the episodes. */

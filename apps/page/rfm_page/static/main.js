@@ -514,7 +514,7 @@ function update() {
   told();
   showWhetherReady();
   page.scored.textContent = curves.length ? howMany() : "";
-  page["scored-by"].textContent = scored.length ? `by ${[...new Set(curves.map(checkpointOf))].join(", ")}` : "";
+  page["scored-by"].textContent = scored.length ? `· ${[...new Set(curves.map(checkpointOf))].join(", ")}` : "";
   page.chart.setAttribute("aria-label", scored.length
     ? scored.map((curve) => `${curve.label}: final ${toldAt(curve, -1)}`).join("; ")
     : "No curves yet.");
@@ -541,7 +541,7 @@ function modelOf({ model }) {
 
 /** The settings belong to the tabs that have some, and what is said of curves to the first. */
 function shownTab(index) {
-  page.fold.disabled = index === 2 || (index === 1 && page["dataset-side"].hidden);
+  page.fold.disabled = index === 1 && page["dataset-side"].hidden;
   page.status.textContent = "";
   const isStep = index !== shownIndex;
   if (isStep) address.settle(); // of the tab that was shown

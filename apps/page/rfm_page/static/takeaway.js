@@ -17,7 +17,12 @@ export function csv(curves) {
       ...instead.map((name) => curve[name]?.[index]),
     ]),
   );
-  return [columns, ...lines].map((values) => values.map(csvField).join(",") + "\r\n").join("");
+  return csvText([columns, ...lines]);
+}
+
+/** Rows of values as CSV. */
+export function csvText(rows) {
+  return rows.map((values) => values.map(csvField).join(",") + "\r\n").join("");
 }
 
 /** The scores that models predict in place of progress. */
