@@ -211,7 +211,9 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
 
     async def probe(self, model: ModelInfo, *, timeout_s: float | None = None) -> None:
         """Score a blank sample, which the server's metrics ignore. Raises RewardError on failure."""
-        await self.progress(blank_trajectory(model.widths), timeout_s=timeout_s, request_id=PROBE_PREFIX)
+        call = self._call({"timeout_s": timeout_s, "request_id": PROBE_PREFIX})
+        call.checks_blank = False
+        results_of(await self._scorer.outcomes([ProgressSample(blank_trajectory(model.widths))], call))
 
     async def is_ready(self, *, timeout_s: float | None = None) -> bool:
         """True if a server has the model ready, as in ``RewardClient.is_ready``."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from encoding import encode
-from rfm_client import ProgressSample, RewardClient, Trajectory, UInt8Array
+from rfm_client import AsyncRewardClient, ProgressSample, RewardClient, Trajectory, UInt8Array
 from rfm_client.frames import BlankFrames, read_video
 from rfm_client.frames.blank_frames import is_blank
 from shelves import Shelf
@@ -89,7 +90,7 @@ CALLS: dict[str, tuple[Callable[[RewardClient], object], int]] = {  # and how ma
     "the second of a pair": (lambda client: client.preference(filmed(VIDEO), filmed(FLOATS)), 3),
     "an episode": (lambda client: [*map(client.episode("stack the cups", sampling="all").add, FLOATS)], 2),
     "one of two pictures": (lambda client: client.progress(filmed(np.stack([BLACK, NOISE]))), 0),
-    "a picture, as of a probe": (lambda client: client.progress(filmed(BLACK[np.newaxis])), 0),
+    "a picture": (lambda client: client.progress(filmed(BLACK[np.newaxis])), 0),
 }
 
 
@@ -103,3 +104,12 @@ def test_a_client_warns_once_of_a_video_of_black_pictures(
     told = "black pictures, no value above 1 (multiply floats in 0..1 by 255 before they become uint8)"
     expected = f"frames: expected pictures that show something, got {count} frames: {told} (logged once)"
     assert caplog.messages == [expected] * (count > 0)
+
+
+def test_a_probe_warns_of_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    async def probe() -> None:
+        async with AsyncRewardClient("", transports=[Shelf(has_encoder=False)]) as client:
+            await client.probe(await client.model_info(frames=True))
+
+    asyncio.run(probe())
+    assert not caplog.messages

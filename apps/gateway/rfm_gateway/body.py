@@ -40,6 +40,7 @@ _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
 _SAMPLE_FIELD = re.compile(r"sample_(0|[1-9][0-9]{0,5})")
 _CHARSETS = ("utf-8", "utf8", "us-ascii")
 _FLAGS = {"true": True, "1": True, "false": False, "0": False, "": False}
+_JSON_COST = 256  # parsing a byte takes as long as copying so many
 _FORM_FLAGS = {**_FLAGS, "1": False}  # as the evaluation server reads forms
 
 Take: TypeAlias = Callable[[int], object]  # takes bytes from a budget, or raises
@@ -142,7 +143,7 @@ class BodyLimits:
 async def read_json(limits: BodyLimits, request: Request) -> Batch:
     """Return the samples in a JSON request. Raises RequestValidationError and the errors from ``limits``."""
     body = await limits.read_json(request)
-    return await off_loop(len(body), _of_json, body)
+    return await off_loop(_JSON_COST * len(body), _of_json, body)
 
 
 async def read_multipart(limits: BodyLimits, request: Request) -> Batch:
@@ -151,8 +152,9 @@ async def read_multipart(limits: BodyLimits, request: Request) -> Batch:
     for name in uploads:
         if name == STEPS_FIELD or _ANY_SAMPLE_FIELD.fullmatch(name):
             raise invalid((name,), "expected a form field, got a file")
-    num_bytes = sum(map(len, fields.values())) + sum(upload.content.nbytes for upload in uploads.values())
-    return await off_loop(num_bytes, _of_form, fields, uploads, num_bytes)
+    num_json_bytes = sum(map(len, fields.values()))
+    num_bytes = num_json_bytes + sum(upload.content.nbytes for upload in uploads.values())
+    return await off_loop(_JSON_COST * num_json_bytes, _of_form, fields, uploads, num_bytes)  # files are not copied
 
 
 def _of_json(body: bytes) -> Batch:

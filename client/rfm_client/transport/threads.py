@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Arguments = ParamSpec("Arguments")
 Returned = TypeVar("Returned")
 
-MIN_BYTES = 2**20  # copying less takes no longer than switching threads
+MIN_BYTES = 2 * 2**20  # copying less takes no longer than switching threads
 
 
 class OneProcess:
