@@ -270,6 +270,12 @@ ORDERS: dict[str, tuple[dict[tuple[int, int], float], list[int | None], list[int
         [1, 2, 0],
         ["agree", "agree", "agree"],
     ),
+    "each beats another": (
+        {(0, 1): 1.0, (1, 0): 0.0, (0, 2): 0.0, (2, 0): 1.0, (1, 2): 1.0, (2, 1): 0.0},
+        [None, None, None],
+        None,
+        ["agree", "agree", "agree"],
+    ),
 }
 
 

@@ -267,6 +267,21 @@ def test_a_server_that_comes_back_with_another_checkpoint_is_reported(caplog: py
         assert client.model_info().weights_digest == "b" * 16
 
 
+def test_one_of_several_servers_that_comes_back_with_another_checkpoint_is_reported(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    stand, other = Stand("grpc://one:1"), Stand("grpc://other:1")
+    with RewardClient("", transports=[stand, other]) as client:
+        assert client.model_info().weights_digest == "a" * 16
+        stand.num_ends, stand.weights_digest = 1, "b" * 16
+
+        def has_told() -> bool:
+            client.progress(SEEN)
+            return f"another checkpoint, rfm (weights {'b' * 16}) instead of rfm" in caplog.text
+
+        wait_for(has_told)
+
+
 @pytest.mark.parametrize("num_servers", [1, 3])
 def test_a_call_under_which_two_processes_end_fails(num_servers: int) -> None:
     stands = [Stand(f"grpc://{number}:1") for number in range(num_servers)]

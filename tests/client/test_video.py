@@ -48,6 +48,7 @@ def test_frames_of_a_variable_rate_are_even_in_number(tmp_path: Path) -> None:
     write_video(tmp_path / "video.mp4", numbered(10), [0, 1, 2, 3, 4, 5, 6, 20, 40, 60])  # 1.6 fps on average
     assert numbers(read_video(tmp_path / "video.mp4"), 10) == list(range(10))
     assert numbers(read_video(tmp_path / "video.mp4", 0.82), 10) == [0, 2, 4, 6, 9]
+    assert numbers(read_video(tmp_path / "video.mp4", start_s=0.3, end_s=0.6), 10) == [3, 4, 5]
 
 
 def test_only_the_picked_frames_of_a_long_video_are_held(tmp_path: Path) -> None:

@@ -84,12 +84,25 @@ def test_the_last_three_frames_decide_who_succeeds_and_an_undone_success_is_a_cl
     assert never.items() <= dict(summarise(labels(file, {2: success[2]}, {2: success[2]})).rows()).items()
 
 
+def test_another_programs_rows_may_be_in_any_order(tmp_path: Path) -> None:
+    file = labels(tmp_path / "other_progress.parquet", {0: RISING, 1: [0.0, 0.1, 0.3, 0.2]})
+    table = parquet.read_table(file)
+    parquet.write_table(table.take(np.argsort(table["frame_index"].to_numpy())), file)
+    summary = summarise(file)
+    assert (summary.episodes.tolist(), summary.final_progress.tolist()) == ([0, 1], np.float32([0.9, 0.2]).tolist())
+    assert evaluate_labels([file]).evaluations[0].final_progress.tolist() == summary.final_progress.tolist()
+
+
 def test_of_two_thresholds_that_are_equally_good_the_lower_counts(tmp_path: Path) -> None:
     file = labels(tmp_path / "a.parquet", {episode: [0.0, episode / 10] for episode in range(8)})
     (found,) = evaluate_labels([file], {episode: episode in (2, 6) for episode in range(8)}).evaluations
     assert found.by_progress is not None
     assert found.by_progress.threshold == 0.15  # at 0.55, 1/2 and 5/6 are right, whose mean is 2/3, too
     assert found.by_progress.balanced_accuracy == pytest.approx((1 + 1 / 3) / 2)
+    below_0 = labels(tmp_path / "b.parquet", {0: [-0.5], 1: [0.1]})  # as Robo-Dopamine's progress may be
+    (found,) = evaluate_labels([below_0], {0: False, 1: True}).evaluations
+    assert found.by_progress is not None
+    assert found.by_progress.threshold == -0.2
 
 
 BARELY_MORE = float(np.nextafter(np.float32(0.9), np.float32(1)))

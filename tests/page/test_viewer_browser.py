@@ -533,7 +533,9 @@ Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts"].map(
     ].map((each) => serverOption(...each));
     const words = lerobotWords("delete", { name: named, kind: "LeRobot v3.0" }, [1], [0, 1]);
     const answer = { videos: [1, null, null, 4].map((rank) => ({ rank })), pairs: [{ verdict: null }, { verdict: "first" }] };
-    done([figure, names, servers, words, sentenceOf({ videos: [..."abcd"].map((title) => ({ title })), answer })]);
+    const circle = { videos: [{ rank: null }, { rank: null }, { rank: null }], pairs: [{ verdict: "first" }] };
+    const sentences = [answer, circle].map((each) => sentenceOf({ videos: [..."abcd"].map((title) => ({ title })), answer: each }));
+    done([figure, names, servers, words, sentences]);
   });
 """
 
@@ -541,11 +543,14 @@ Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts"].map(
 def test_modules_cut_names_name_a_reachable_triton_and_lead_a_line_over_skipped_frames(page: Page) -> None:
     """Of seven frames the model skips three, and the score of one is missing."""
     dataset = "Ann's set; touch \n$(touch x)"
-    markup, names, servers, words, sentence = page.browser.driver.execute_async_script(MODULES, dataset)
+    markup, names, servers, words, sentences = page.browser.driver.execute_async_script(MODULES, dataset)
     assert names == ["rollout_seed…100k.mp4", "success.mp4"]
     assert servers == [["--url", "grpc://127.0.0.1:8001"], [], ["--url", "grpc://triton:8001"]]
     assert shlex.split(words, comments=True)[:4] == ["lerobot-edit-dataset", "--repo_id", dataset, "--root"]
-    assert sentence == "a does the task best, but b, c have no rank: some answers depend on which video comes first."
+    assert sentences == [
+        "a does the task best, but b, c have no rank: some answers depend on which video comes first.",
+        "No best video: several win equally often.",
+    ]
     svg = ElementTree.fromstring(markup)
     assert [len(line.attrib["points"].split()) for line in svg.iter(f"{SVG}polyline")] == [2, 1]
     assert "\N{MINUS SIGN}0.5" in texts(svg)  # the axis reaches the score below 0

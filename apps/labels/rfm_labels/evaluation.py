@@ -161,13 +161,11 @@ def _names(files: Sequence[Path]) -> list[str]:
 def _episodes(file: Path) -> dict[int, _Scores]:
     table = read_label_table(file)
     require(file, len(table) > 0, "labels", "none")
-    episodes = table["episode_index"].to_numpy()
-    frames, progress = table["frame_index"].to_numpy(), table[PROGRESS].to_numpy()
+    progress = table[PROGRESS].to_numpy()
     success = table[SUCCESS].to_numpy() if SUCCESS in table.column_names else None
     scores = {}
-    order = np.lexsort((frames, episodes))
-    numbers, starts = np.unique(episodes[order], return_index=True)
-    for episode, own in zip(numbers.tolist(), np.split(order, starts[1:]), strict=True):
+    numbers, starts = np.unique(table["episode_index"].to_numpy(), return_index=True)
+    for episode, own in zip(numbers.tolist(), np.split(np.arange(len(table)), starts[1:]), strict=True):
         rows = own[np.isfinite(progress[own])]  # NaN: unlabelled frame
         require(f"{file}: episode {episode}", len(rows) > 0, "progress", "none")
         predicted = None if success is None or np.isnan(success[rows]).any() else success[rows]
@@ -219,7 +217,7 @@ def _ranking(numbers: Floats, is_success: npt.NDArray[np.bool_] | None) -> Ranki
     false_positives, true_positives, thresholds = roc_curve(is_success, numbers, drop_intermediate=False)
     accuracies = (true_positives + 1 - false_positives) / 2
     best = np.flatnonzero(np.isclose(accuracies, accuracies.max(), rtol=0, atol=_ROUNDING))[-1]  # the lowest threshold
-    threshold = _between(numbers[numbers < thresholds[best]].max(initial=0.0), thresholds[best])
+    threshold = _between(max(numbers[numbers < thresholds[best]], default=0.0), thresholds[best])
     return Ranking(float(roc_auc_score(is_success, numbers)), threshold, float(accuracies[best]))
 
 

@@ -24,6 +24,7 @@ from rfm_labels.metadata import (
     blank_from_metadata,
     parsed_object,
     skipping_in,
+    values_of,
 )
 from rfm_labels.plan import Plan
 from rfm_labels.writing import (
@@ -100,7 +101,7 @@ def _prefix(file: Path) -> str:
 def read_label_table(file: Path, *, episode: int | None = None) -> Any:
     """Read a label file in any format as a pyarrow Table, with the parts' column names. Raises DatasetError.
 
-    Score columns: those in ``SCORES`` that the file has.
+    Rows are sorted by episode and frame. Score columns: those in ``SCORES`` that the file has.
 
     episode: read only this episode's rows; None: all
     """
@@ -113,7 +114,9 @@ def read_label_table(file: Path, *, episode: int | None = None) -> Any:
         table = parquet.read_table(file, columns=list(columns.values()), filters=filters, partitioning=None)
     except (OSError, ArrowException) as error:
         raise _no_labels(file, error) from error
-    return table.select(list(columns.values())).rename_columns(list(columns))
+    table = table.select(list(columns.values())).rename_columns(list(columns))
+    order = np.lexsort((values_of(table["frame_index"]), values_of(table["episode_index"])))
+    return table if np.array_equal(order, np.arange(len(order))) else table.take(order)
 
 
 def read_blank(file: Path) -> BlankCameras:

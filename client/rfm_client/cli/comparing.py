@@ -21,7 +21,7 @@ from rfm_client.frames.fit_to_checkpoint import fitted, with_frame_indices
 
 LEGEND = (
     "no answer: the orders disagree, or both are exactly 0.5.\n"
-    "A video has no rank (?) if one of its pairs has no answer."
+    "A video has no rank (?) if one of its pairs has no answer, or another wins as often."
 )
 
 

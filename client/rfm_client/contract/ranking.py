@@ -74,14 +74,15 @@ class Ranking:
 
     @cached_property
     def ranks(self) -> list[int | None]:
-        """Each trajectory's rank by ``wins``, from 1; None if a pair with this trajectory has no verdict."""
-        best_first = sorted(self.numbers, key=self.wins.__getitem__, reverse=True)
+        """Each trajectory's rank by ``wins``, from 1; None if one of its pairs has no verdict, or wins tie."""
+        best_first = sorted(self.wins, reverse=True)
         unranked = {index for couple in self.couples() if self.pair(*couple).verdict is None for index in couple}
-        return [None if index in unranked else best_first.index(index) + 1 for index in self.numbers]
+        unranked |= {index for index in self.numbers if self.wins.count(self.wins[index]) > 1}
+        return [None if index in unranked else best_first.index(self.wins[index]) + 1 for index in self.numbers]
 
     @property
     def ranking(self) -> list[int] | None:
-        """The trajectories' indices, best first; None if a pair has no verdict."""
+        """The trajectories' indices, best first; None if one has no rank."""
         if None in self.ranks:
             return None
         return sorted(self.numbers, key=lambda index: cast(int, self.ranks[index]))

@@ -136,10 +136,10 @@ def _spread(total: int, count: int) -> npt.NDArray[np.int64]:
 
 
 def _within(packets: Packets, start_s: float | None, end_s: float | None) -> tuple[int, int]:
-    """Return the first frame numbers at or after ``start_s`` and ``end_s``, within half a frame."""
-    half_s, times_s = 0.5 / packets.fps, packets.since_first_s
-    bounds_s = [(start_s or 0.0) - half_s, (math.inf if end_s is None else end_s) - half_s]
-    first, end = np.searchsorted(times_s, bounds_s).tolist()
+    """Return the first frame numbers at or after ``start_s`` and ``end_s``, within half the time to the next frame."""
+    times_s = packets.since_first_s
+    latest_s = times_s + 0.5 * np.minimum(1 / packets.fps, np.diff(times_s, append=math.inf))
+    first, end = np.searchsorted(latest_s, [start_s or 0.0, math.inf if end_s is None else end_s]).tolist()
     if first >= end:
         got = f"{start_s} to {end_s} of {times_s[-1] if len(times_s) else 0.0:g} s"
         raise InvalidSampleError.at("start_s to end_s", "a part with frames", got)

@@ -295,11 +295,12 @@ class SampleScorer:
     async def _tell_of_change(self, before: ModelInfo, model: str, deadline: Deadline) -> None:
         """Log that a server that was lost came back with another checkpoint, if it did."""
         try:
-            now = await self.model_info(model, deadline, refresh=True)
+            infos = await self.model_infos(model, deadline)
         except RewardError as error:
             logger.warning("%s: a server is back; cannot tell whether it serves the same checkpoint: %s", model, error)
             return
-        if now.weights_digest != before.weights_digest:
+        now = next((info for info in infos if info.weights_digest != before.weights_digest), None)
+        if now is not None:
             told = [f"{info.source or info.name} (weights {info.weights_digest})" for info in (now, before)]
             logger.warning(
                 "%s: a server is back with another checkpoint, %s instead of %s: scores do not mix", model, *told

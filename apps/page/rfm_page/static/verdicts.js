@@ -11,7 +11,9 @@ export function sentenceOf({ videos, answer }) {
   const [first, second] = videos.map(({ title }) => title);
   if (!answer) return `${first} and ${second} are one file, so neither is better.`;
   const best = answer.videos.findIndex(({ rank }) => rank === 1);
-  if (answer.pairs.every(({ verdict }) => verdict)) return `${videos[best].title} does the task ${videos.length > 2 ? "best" : "better"}.`;
+  const isAnswered = answer.pairs.every(({ verdict }) => verdict);
+  if (isAnswered && best < 0) return "No best video: several win equally often.";
+  if (isAnswered) return `${videos[best].title} does the task ${videos.length > 2 ? "best" : "better"}.`;
   const [{ orders_agree: agree }, ...others] = answer.pairs;
   const unranked = videos.filter((_, index) => answer.videos[index].rank === null).map(({ title }) => title).join(", ");
   if (others.length) return `${best < 0 ? "No best video" : `${videos[best].title} does the task best, but ${unranked} have no rank`}: some answers depend on which video comes first.`;
