@@ -16,6 +16,7 @@ import transports
 from engine_server import EngineServer
 from rfm_client import (
     FrameSize,
+    InferenceFailedError,
     InvalidSampleError,
     ProgressResult,
     RewardClient,
@@ -302,12 +303,18 @@ def test_kept_frames_are_scored_when_asked_and_several_episodes_in_one_request(
 SHORT, LONG = replace(V1, max_frames=4), replace(V2, max_frames=8)
 
 
-def test_as_many_frames_are_shown_as_the_served_checkpoint_was_trained_on_by_now() -> None:
-    shelf = Shelf(SHORT, LONG, after=3, has_encoder=False)
+def test_an_episode_is_scored_by_one_checkpoint_and_the_next_one_as_the_served_checkpoint_was_trained() -> None:
+    shelf, frames = Shelf(SHORT, LONG, after=3, has_encoder=False), video(123, 5)
     with RewardClient("", transports=[shelf]) as client, client.episode(TASK) as episode:
-        for frame in video(123, 5):
+        for frame in frames[:3]:
             episode.add(frame)
-    assert [shape[1] for shape in shelf.shapes] == [4, 4, 4, 4, 8]  # the fourth answer is by another checkpoint
+        for _ in range(2):
+            got = r"weights-of-v2\) instead of rfm_frames \(weights weights-of-v1\): reset the episode"
+            with pytest.raises(InferenceFailedError, match=rf"^episode: expected the checkpoint .* got .*{got}"):
+                episode.add(frames[3])
+        episode.reset()
+        assert episode.add(frames[4]).step == 0
+    assert [shape[1] for shape in shelf.shapes] == [4, 4, 4, 4, 8, 8]  # the fourth answer is by another checkpoint
 
 
 def test_frames_are_resized_as_the_served_checkpoint_reads_them_by_now() -> None:
@@ -316,8 +323,9 @@ def test_frames_are_resized_as_the_served_checkpoint_reads_them_by_now() -> None
     large = replace(LONG, frame_size=FrameSize("exact", (16, 16)))
     frames, shelf = video(124, 2), Shelf(small, large, after=1, has_encoder=False)
     with RewardClient("", transports=[shelf]) as client, client.episode(TASK, resize=True) as episode:
-        for frame in frames:
-            episode.add(frame)
+        episode.add(frames[0])
+        with pytest.raises(InferenceFailedError, match="reset the episode"):
+            episode.add(frames[1])
         with pytest.raises(InvalidSampleError, match=r"as the episode's first, or a reset, got uint8 \[16, 16, 3\]"):
             episode.add(frames[0])
         assert {shape[2:4] for shape in shelf.shapes} == {(8, 8)}

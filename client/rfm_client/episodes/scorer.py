@@ -78,15 +78,21 @@ class StepScorer:
         return await self._scorer.model_info(self._model, call.deadline)
 
     async def scores(self, asked: Sequence[Asked], call: Call) -> list[StepScore]:
-        """Return a score for each step, from as few requests as possible. Raises RewardError, ValueError."""
+        """Return a score for each step, from as few requests as possible. Raises RewardError, ValueError.
+
+        InferenceFailedError: another checkpoint scored an episode's earlier steps
+        """
         info = await self.model_info(call)
         shown = [steps.windows(step, info) for steps, step in asked]
         outcomes = iter(await self._all_outcomes([each for _, windows in shown for each in windows], info, call))
         ms = call.deadline.passed_s * 1e3
-        return [
+        scores = [
             steps.score(step, prefix, list(islice(outcomes, len(windows))), ms)
             for (steps, step), (prefix, windows) in zip(asked, shown, strict=True)
         ]
+        for steps, _ in asked:
+            steps.check_checkpoint(self._scorer.changes)
+        return scores
 
     async def in_turn(
         self,

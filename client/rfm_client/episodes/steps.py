@@ -13,7 +13,7 @@ import numpy as np
 from rfm_client.contract import wire
 from rfm_client.contract.checks import require
 from rfm_client.contract.description import FrameSize, ModelInfo
-from rfm_client.contract.errors import InvalidSampleError, RewardError
+from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, RewardError
 from rfm_client.contract.results import FRAME_SCORES, FrameScores, ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array, as_array, check_task
 from rfm_client.episodes.options import EpisodeOptions, StepScore, StepValue
@@ -73,6 +73,7 @@ class Steps:
         self._where = where
         self._corrections = options.corrections
         self.frames: list[tuple[Frame, ...]] = []  # by step and camera
+        self._num_changes: int | None = None  # of the checkpoint, until the first score
 
     @property
     def newest(self) -> int:
@@ -139,6 +140,18 @@ class Steps:
             name: array[-1].item() for name, array in fused.arrays.items() if not FRAME_SCORES[name].is_always_asked
         }
         return StepScore(float(fused.progress[-1]), float(fused.success[-1]), succeeded, step, ms, more)
+
+    def check_checkpoint(self, changes: Sequence[str]) -> None:
+        """Raise InferenceFailedError if the checkpoint has changed since the episode's first score.
+
+        changes: all that the client has seen
+        """
+        if self._num_changes is None:
+            self._num_changes = len(changes)
+        if self._num_changes != len(changes):
+            where = self._where or "episode"
+            expected = "the checkpoint that scored its first steps"
+            raise InferenceFailedError(f"{where}: expected {expected}, got {changes[-1]}: reset the episode")
 
     def _check_predicted(self, scores: FrameScores) -> None:
         """Raise ValueError if the checkpoint does not predict the score that the options name."""

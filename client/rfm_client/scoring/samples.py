@@ -114,6 +114,8 @@ class SampleScorer:
         self._concurrency = concurrency
         self._infos: dict[str, ModelInfo] = {}  # until another model version answers, or a lost server
         self._returns = 0  # of servers, when the descriptions were last compared
+        self._comparing = asyncio.Lock()
+        self.changes: list[str] = []  # of the checkpoint, if there is one server alone: which instead of which
         self._undescribed: set[str] = set()  # not asked about embeddings again, which they score without a description
         self._checks_lengths = True  # until a trajectory was too long
         self._checks_blank = True  # until a video was blank
@@ -284,27 +286,36 @@ class SampleScorer:
         except RewardError as error:
             error.request_id = request_id
             raise
-        known = self._infos.get(model)
-        if known is not None and self._servers.returns != self._returns:
-            self._returns = self._servers.returns
-            await self._tell_of_change(known, model, call.deadline)
-        elif known is not None and known.versions and answer.model_version not in known.versions:
-            del self._infos[model]
+        if self._may_differ(model, answer) or self._comparing.locked():
+            async with self._comparing:  # no answer of another checkpoint before its change is known
+                if self._may_differ(model, answer):
+                    await self._compare(self._infos[model], model, call.deadline)
         return answer
 
-    async def _tell_of_change(self, before: ModelInfo, model: str, deadline: Deadline) -> None:
-        """Log that a server that was lost came back with another checkpoint, if it did."""
+    def _may_differ(self, model: str, answer: Answer) -> bool:
+        """True if the checkpoint that answered may be another than the described one."""
+        known = self._infos.get(model)
+        if known is None:
+            return False
+        is_new = bool(known.versions) and answer.model_version not in known.versions
+        return is_new or self._servers.returns != self._returns
+
+    async def _compare(self, before: ModelInfo, model: str, deadline: Deadline) -> None:
+        """Describe the models anew, and log that another checkpoint answers, if it does."""
+        self._returns = self._servers.returns
+        self._infos.clear()
         try:
             infos = await self.model_infos(model, deadline)
         except RewardError as error:
-            logger.warning("%s: a server is back; cannot tell whether it serves the same checkpoint: %s", model, error)
+            logger.warning("%s: cannot tell whether the checkpoint is the same as before: %s", model, error)
             return
         now = next((info for info in infos if info.weights_digest != before.weights_digest), None)
         if now is not None:
             told = [f"{info.source or info.name} (weights {info.weights_digest})" for info in (now, before)]
-            logger.warning(
-                "%s: a server is back with another checkpoint, %s instead of %s: scores do not mix", model, *told
-            )
+            change = "another checkpoint, {} instead of {}".format(*told)
+            logger.warning("%s: served by %s: scores do not mix", model, change)
+            if len(self._servers) == 1:
+                self.changes.append(change)
 
 
 def _longest(sample: Sample) -> int:
