@@ -73,6 +73,7 @@ class Shelf:
             video_dim=video_dim,
             text_dim=text_dim,
             trained_frames=now.max_frames,
+            has_preference=True,
             frame_size=now.frame_size,
             weights_digest=now.weights,
             settings_digest=now.settings,
