@@ -69,7 +69,7 @@ def try_video(
         steps.insert(0, ("score the video with a public checkpoint", public))
     else:
         measure = command("rfm-client", "evaluate", "DATASET", "--outcome", "outcomes.csv")
-        steps.append((f"is it right on your robot? Label episodes and measure it: {HOW_GOOD}", measure))
+        steps.insert(0, (f"is it right on your robot? Label episodes and measure it: {HOW_GOOD}", measure))
     typer.echo(next_steps(*steps))
 
 

@@ -20,6 +20,7 @@ from engine_server import EngineServer
 from rfm_client import (
     FrameScores,
     InferenceFailedError,
+    InvalidSampleError,
     ModelInfo,
     PreferenceResult,
     ProgressResult,
@@ -189,6 +190,15 @@ def test_compare_refuses_the_answers_of_two_versions(tmp_path: Path, video: Path
         pytest.raises(InferenceFailedError, match=r"^model_version: expected one for all videos, got 1, 2: ask again$"),
     ):
         compare(client, [str(video), str(tmp_path / "small.npy")], VideoOptions(task=TASK))
+
+
+def test_compare_says_what_to_do_without_a_preference_head(video: Path) -> None:
+    told = "expected a checkpoint with a preference head, got rfm_frames; compare final progress with rfm-client score"
+    with (
+        RewardClient("", transports=[Shelf(has_preference=False)]) as client,
+        pytest.raises(InvalidSampleError, match=f"^compare: {told}$"),
+    ):
+        compare(client, [str(video)] * 2, VideoOptions(task=TASK))
 
 
 def test_a_plot_has_a_strip_for_each_video_and_is_drawn_without_scores_too(tmp_path: Path) -> None:
