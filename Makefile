@@ -214,7 +214,7 @@ $(BIN)/uv:
 	$(BIN)/pip install --quiet --disable-pip-version-check uv==$(UV)
 
 $(RUNS): $(PINS) | $(BIN)/uv
-	@echo "installing 1.5 GB into $(VENV), with CUDA 4.2 GB (without a GPU: UV_TORCH_BACKEND=cpu make demo) ..."
+	@echo "installing 1.5 GB into $(VENV), with CUDA 5 GB (without a GPU: UV_TORCH_BACKEND=cpu make demo) ..."
 	$(INSTALL) --editable "client[cli]" --editable apps/gateway --editable apps/page --editable ".[encoders,vlm,triton,demo]"
 	touch $@
 
