@@ -209,10 +209,12 @@ INSTALL = $(UV_SETTINGS) $(BIN)/uv pip install --quiet --python $(BIN)/python --
 
 $(BIN)/uv:
 	@$(PYTHON) -c $(CHECK_PYTHON)
+	@echo "making $(VENV) ..."
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check uv==$(UV)
 
 $(RUNS): $(PINS) | $(BIN)/uv
+	@echo "installing 1.5 GB into $(VENV), with CUDA 5 GB (without a GPU: UV_TORCH_BACKEND=cpu make demo) ..."
 	$(INSTALL) --editable "client[cli]" --editable apps/gateway --editable apps/page --editable ".[encoders,vlm,triton,demo]"
 	touch $@
 

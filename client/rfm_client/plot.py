@@ -56,7 +56,7 @@ _SUCCESS_IN = 0.7
 _LINE_IN = 0.15  # one text line
 _LONGEST = 44  # characters that fit in a one-column legend
 _SHORT = 20  # characters that let two names fit side by side
-_DOTS = 8  # on a long curve, about
+_MOST_DOTS = 40  # on a curve, one for each scored frame; a longer curve has none
 _LINES = ("-", "--", "-.", ":")
 
 
@@ -109,10 +109,9 @@ def plot_scores(
             for number, (result, x) in enumerate(zip(results, positions, strict=True)):
                 if score not in ("success", result.leading):
                     continue
-                colour, line = colours[number % len(colours)], _LINES[number // len(colours)]
-                step = max(len(results), len(x) // _DOTS)
-                first = number * step // len(results) % len(x)  # staggered dots tell equal curves apart
-                style = {"color": colour, "linestyle": line, "marker": "o", "markevery": (first, step)}
+                # Gaps in a line show an equal one below it.
+                colour, line = colours[number % len(colours)], _LINES[(number + number // len(colours)) % len(_LINES)]
+                style = {"color": colour, "linestyle": line, "marker": "o" if len(x) <= _MOST_DOTS else ""}
                 label = _shortened(names[number]) if score == result.leading else None
                 values = getattr(result, score)
                 known = ~np.isnan(values)  # the line skips frames without an answer

@@ -23,7 +23,7 @@ import typer
 from rfm.config import ExportConfig
 from rfm.parameters import EXPORT_VERSION
 from rfm.serve.processes import ProcessGroup, how_it_ended
-from rfm.serve.repository import CHECKPOINT_FILES, CONFIG_FILE, models_in
+from rfm.serve.repository import CONFIG_FILE, checkpoint_in, has_checkpoint, models_in
 from rfm.serve.triton_server import stopped_by_signals
 from rfm_commands.command import RfmCommand, fail, say, timed_steps
 
@@ -40,7 +40,7 @@ def is_checkpoint(word: str) -> bool:
     folder = Path(word)
     if folder.exists():
         is_served = (folder / CONFIG_FILE).exists() or bool(models_in(folder))
-        return not is_served and any((folder / name).exists() for name in CHECKPOINT_FILES)
+        return not is_served and has_checkpoint(folder)
     return "/" in word and not word.startswith(("/", ".", "~"))
 
 
@@ -49,6 +49,9 @@ def exported(settings: ExportConfig) -> Path:
 
     Raises typer.Exit after a message, SystemExit after a signal.
     """
+    folder = Path(str(settings.checkpoint))
+    if not has_checkpoint(folder) and (inner := checkpoint_in(folder)):
+        fail(f"checkpoint: expected a checkpoint, got {folder}, a folder that holds one; name {inner}")
     command = [sys.executable, "-m", __name__, json.dumps(vars(settings))]
     with stopped_by_signals():
         group = ProcessGroup(command, stdout=subprocess.PIPE)

@@ -18,6 +18,7 @@ import typer
 from rfm.config import CheckpointConfig, ExportConfig, ServeConfig
 from rfm.serve.access import NO_KEY, Endpoints, callers_restrictions, new_key, read_key, take_key
 from rfm.serve.installation import ServerStartError, find_installation, has_gpu, without_gpus
+from rfm.serve.repository import models_in, no_models
 from rfm.serve.supervisor import CrashLoopError, GatewayProcess, Supervisor
 from rfm.serve.triton_server import TritonServer, short_spin
 from rfm_client.cli.command import MOST_COLUMNS, OptionValues, with_options
@@ -115,6 +116,8 @@ def export(
         differences = rfm_export.check(repository, settings)
         for difference in differences:
             say(difference)
+        if differences and config_file is None:
+            say("if the export had settings of a file, name the file with --config")
         if differences:
             raise typer.Exit(1)
         typer.echo(f"{repository}: every generated file is as an export would write it")
@@ -275,6 +278,8 @@ def _served(
             raise typer.BadParameter("give CHECKPOINT or --checkpoint, not both")
         checkpoint = word
     elif (folder := repository if word is None else Path(word)) is not None:
+        if given and not models_in(folder):
+            fail(no_models(folder))
         if given:
             option = CheckpointConfig.settings()[next(iter(given))].option
             raise typer.BadParameter(f"{option} decides an export, but {folder} names a repository")

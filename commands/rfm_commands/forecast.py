@@ -24,6 +24,7 @@ DOWNLOAD_BYTES_PER_S = 15e6
 # Host memory, as a multiple of bfloat16 weights, for a CPU as measured: benchmarks/results/results.md
 EXPORT_ON_CPU, EXPORT_BESIDE_GPU = 5.7, 2.6  # beside a GPU nothing becomes float32
 SERVE_ON_CPU, SERVE_ROUNDED_ON_CPU = 3.0, 1.0  # rounded weights do not become float32
+EXPORT_PROCESS, SERVE_PROCESSES = 0.4e9, 0.7e9  # bytes without weights, as measured with a ReWiND's encoders
 PLAINLY = 0.75  # less of this memory is too little; some networks need less than others
 ROUNDED = {None: 1.0, "int8": 0.6, "nf4": 0.4}  # size of rounded weights; embeddings are not rounded
 BYTES_PER_PARAMETER = 2  # bfloat16
@@ -70,9 +71,9 @@ def needs(found: Found, settings: ExportConfig, num_gpus: int, cache: Path) -> I
     is_known = found.float32_bytes is not None  # else only the line says what is needed
     free = [torch.cuda.mem_get_info(index)[0] for index in range(num_gpus)]
     is_compared_on_gpu = max(free, default=0) >= WORKING_ROOM * found.weights_bytes
-    export = loaded * (EXPORT_BESIDE_GPU if is_compared_on_gpu else EXPORT_ON_CPU)
+    export = loaded * (EXPORT_BESIDE_GPU if is_compared_on_gpu else EXPORT_ON_CPU) + EXPORT_PROCESS
     multiple = SERVE_ON_CPU if settings.weights is None else SERVE_ROUNDED_ON_CPU
-    serve = 0 if free else loaded * multiple
+    serve = 0 if free else loaded * multiple + SERVE_PROCESSES
     host = psutil.virtual_memory().available
     then = "" if free else f", then {size(serve)} to serve"
     line = f"memory: about {size(export)} to export{then}; {size(host)} are free"

@@ -11,6 +11,7 @@ import typer
 
 from rfm.config import CheckpointConfig, ExportConfig
 from rfm.serve.access import Endpoints
+from rfm.serve.repository import models_in, no_models
 from rfm.serve.triton_server import stopped_by_signals, temporary_server
 from rfm_client import RewardClient, Trajectory
 from rfm_client.cli.command import OptionValues, with_options
@@ -24,6 +25,7 @@ from rfm_commands.cached_export import exported
 from rfm_commands.command import TritonPath, fail
 
 REPOSITORY = Path("model_repository")
+HOW_GOOD = "docs/guides/how_good_is_it.md"
 
 
 @with_options
@@ -49,6 +51,8 @@ def try_video(
     if is_blank(task):
         raise typer.BadParameter(f"expected a sentence, got {task!r}", param_hint="'--task'")
     settings = ExportConfig(**given)
+    if settings.checkpoint is None and not models_in(repository):
+        fail(f"{no_models(repository)}; --checkpoint {PUBLIC_CHECKPOINT} serves a public checkpoint")
     with stopped_by_signals():
         frames = read_video(video, rate.fps)
         try:
@@ -57,12 +61,15 @@ def try_video(
             fail(f"{output}: expected a folder that can be made, got: {error.strerror}; --output names another one")
         served = repository if settings.checkpoint is None else _exported_frames(settings)
         with temporary_server(served, output / "tritonserver.log", tritonserver) as endpoints:
-            info = score_video(endpoints, video, frames, task, output / "rewards.png")
+            info = score_video(endpoints, video, frames, task, output / f"{video.stem}.scores.png")
     source = [repository] if settings.checkpoint is None else [settings.checkpoint, *_words(given)]
     steps = steps_without_server(source, video, task)
     if info.warning:
         public = command("rfm", "try", video, "--task", task, "--checkpoint", PUBLIC_CHECKPOINT)
         steps.insert(0, ("score the video with a public checkpoint", public))
+    else:
+        measure = command("rfm-client", "evaluate", "DATASET", "--outcome", "outcomes.csv")
+        steps.insert(0, (f"is it right on your robot? Label episodes and measure it: {HOW_GOOD}", measure))
     typer.echo(next_steps(*steps))
 
 

@@ -32,7 +32,7 @@ from rfm_export.source import (
     read_for_export,
     with_batch_size,
 )
-from rfm_export.verify import compare
+from rfm_export.verify import compare, device_of
 
 
 def _nobody(line: str) -> None:
@@ -57,8 +57,7 @@ def export(
     other_machine: True: another machine serves the export, so ``num_gpus`` may exceed this machine's GPUs
     family: package of the checkpoint's family, which the server must also be able to import; None: a built-in family
     device: where scores are compared; None: the CPU, for a large network a GPU with enough free memory
-    say: receives lines for the user: the run's config.yaml, ``rfm.published.notes``, a derived ``max_batch_size``, the
-        device for a large network
+    say: receives lines for the user: the run's config.yaml, ``rfm.published.notes``, a derived ``max_batch_size``
     begin: receives each step that may take minutes, as it begins
 
     Raises CheckpointError, ExportError.
@@ -73,8 +72,9 @@ def export(
         begin(f"writing version {version.number}")
         with _needing_disk(repository):
             _save(read, version, staged)
-        begin("comparing the export's scores with the checkpoint's")
-        if (difference := compare(read, version, staged, say)) is not None:
+        on = device_of(read)
+        begin(f"comparing the export's scores with the checkpoint's on {on}")
+        if (difference := compare(read, version, staged, on, say)) is not None:
             description = replace(read.description, weights_difference=difference)
             models = generated_models(description, read.of_encoders, version)
         with _needing_disk(repository):

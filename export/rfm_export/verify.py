@@ -40,13 +40,14 @@ PROBE_FRAME_STEPS = 2
 WORKING_ROOM = 1.5  # times the weights' bytes, for weights and a pass over a few small samples
 
 
-def compare(source: Source, version: Version, staged: Path, say: Printer) -> float | None:
+def compare(source: Source, version: Version, staged: Path, device: torch.device, say: Printer) -> float | None:
     """Raise ExportDiffersError unless the staged weights give the checkpoint's scores.
 
     Return the largest difference that rounding the weights makes to the first score; None: nothing is rounded.
+    device: from ``device_of``
     """
     difference = _difference(source, say)
-    _compare_staged(source, version, staged, say)
+    _compare_staged(source, version, staged, device, say)
     return difference
 
 
@@ -66,13 +67,9 @@ def _difference(source: Source, say: Printer) -> float | None:
     return float(f"{largest:.2g}")
 
 
-def _compare_staged(source: Source, version: Version, staged: Path, say: Printer) -> None:
+def _compare_staged(source: Source, version: Version, staged: Path, device: torch.device, say: Printer) -> None:
     description, settings = source.checkpoint.description, source.settings
-    dtype = settings.torch_dtype if description.is_large else None
-    device = source.device or device_for(source.checkpoint, dtype, may_use_gpu=settings.num_gpus != 0)
-    engine = partial(Engine.of, device=device, dtype=dtype)
-    if description.is_large:
-        say(f"the export's scores are compared with the checkpoint's on {device} (--device names another one)")
+    engine = partial(Engine.of, device=device, dtype=_dtype(source))
 
     def exported(*, cuda_graphs: bool = False) -> Engine:
         checkpoint = families.load(version.checkpoint_folder(description, staged), family=source.family.name)
@@ -88,7 +85,17 @@ def _compare_staged(source: Source, version: Version, staged: Path, say: Printer
         if settings.cuda_graphs and device.type == "cuda":
             verify_graphs(partial(exported, cuda_graphs=True), description, say)
         elif settings.cuda_graphs:
-            say(f"cuda_graphs: not compared with plain passes: {device} runs no CUDA graphs (--device names a GPU)")
+            say(f"cuda_graphs: not compared with plain passes on {device}; rfm export --device names a GPU")
+
+
+def _dtype(source: Source) -> torch.dtype | None:
+    return source.settings.torch_dtype if source.checkpoint.description.is_large else None
+
+
+def device_of(source: Source) -> torch.device:
+    """Return where export and checkpoint are compared: the user's device, else the default."""
+    may_use_gpu = source.settings.num_gpus != 0
+    return source.device or device_for(source.checkpoint, _dtype(source), may_use_gpu=may_use_gpu)
 
 
 def device_for(checkpoint: Checkpoint, dtype: torch.dtype | None, *, may_use_gpu: bool) -> torch.device:
@@ -124,7 +131,7 @@ def needing_room(device: torch.device) -> Iterator[None]:
     except torch.OutOfMemoryError as error:
         reason = str(error).partition("\n")[0].partition(". ")[0]
         expected = f"room on {device} to compare the export with the checkpoint"
-        raise ExportError.at("device", expected, reason, "--device names another one") from error
+        raise ExportError.at("device", expected, reason, "rfm export --device names another one") from error
 
 
 def probes(description: Description, *, with_encoders: bool, seed: int = 0) -> list[Sample]:

@@ -77,7 +77,7 @@ def file_name(file: Path, folder: Path) -> str:
 def assumption_lines(assumptions: Sequence[Assumption]) -> list[str]:
     """Return one line for the user about all assumptions, or an empty list."""
     listed = "; ".join(each.text for each in assumptions)
-    line = f"assumed, and not shown by the checkpoint: {listed}; scores differ from the run's if it had others"
+    line = f"not shown by the checkpoint: {listed}; scores differ from the run's if it had others"
     return [line] if assumptions else []
 
 

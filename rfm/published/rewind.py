@@ -82,7 +82,7 @@ def _loaded(
     of_encoders = []
     for kind, source, option, weights in zip(("image", "text"), sources, named, own, strict=True):
         given = f"--{kind}-encoder" if option else UPSTREAM_DEFAULT
-        whose = "weights of the checkpoint" if weights else "only its width agrees"
+        whose = "its weights are the checkpoint's" if weights else "only its width agrees"
         of_encoders.append(Assumption(f"{kind}_encoder", source_name(source), f"{given}; {whose}"))
     load = partial(_encoders, checkpoint, sources)
     return Loaded(checkpoint, (*assumed, *of_encoders), lambda _checkpoint: _encoder_notes(sources), load)

@@ -32,6 +32,20 @@ def models_in(repository: Path) -> list[str]:
     return sorted(file.parent.name for file in repository.glob(f"*/{CONFIG_FILE}"))
 
 
+def has_checkpoint(folder: Path) -> bool:
+    """True if the folder has a checkpoint's files."""
+    return any((folder / name).exists() for name in CHECKPOINT_FILES)
+
+
+def checkpoint_in(folder: Path) -> str | None:
+    """Return the checkpoint in a training's folder, and its encoders, as on a command line; None: there is none."""
+    inner = folder / CHECKPOINT_FOLDER
+    if not has_checkpoint(inner):
+        return None
+    there = [name for name in ("image_encoder", "text_encoder") if (folder / name).is_dir()]
+    return " ".join([str(inner), *(f"--{name.replace('_', '-')} {folder / name}" for name in there)])
+
+
 def no_models(repository: Path) -> str:
     """Return the error message for a folder without models, with the remedy."""
     got, remedy = _found(repository)
@@ -49,16 +63,13 @@ def _found(folder: Path) -> tuple[str, str]:
     above = next((path for path in folder.resolve().parents[:_LEVELS_ABOVE] if models_in(path)), None)
     if above is not None:
         return "a folder inside one", f"--repository {above}"
-    if any((folder / name).exists() for name in CHECKPOINT_FILES):
+    if has_checkpoint(folder):
         return "a checkpoint", f"rfm serve {folder} exports and serves it"
     below = next((file.parent.parent for file in sorted(folder.glob(f"*/*/{CONFIG_FILE}"))), None)
     if below is not None:
         return "a folder that has one", f"--repository {below}"
-    inner = folder / CHECKPOINT_FOLDER
-    if any((inner / name).exists() for name in CHECKPOINT_FILES):
-        there = [name for name in ("image_encoder", "text_encoder") if (folder / name).is_dir()]
-        options = "".join(f" --{name.replace('_', '-')} {folder / name}" for name in there)
-        return "a folder that holds a checkpoint", f"rfm serve {inner}{options} exports and serves it"
+    if inner := checkpoint_in(folder):
+        return "a folder that holds a checkpoint", f"rfm serve {inner} exports and serves it"
     return "which has none", f"{new} writes them"
 
 

@@ -20,6 +20,7 @@ from engine_server import EngineServer
 from rfm_client import (
     FrameScores,
     InferenceFailedError,
+    InvalidSampleError,
     ModelInfo,
     PreferenceResult,
     ProgressResult,
@@ -191,6 +192,15 @@ def test_compare_refuses_the_answers_of_two_versions(tmp_path: Path, video: Path
         compare(client, [str(video), str(tmp_path / "small.npy")], VideoOptions(task=TASK))
 
 
+def test_compare_says_what_to_do_without_a_preference_head(video: Path) -> None:
+    told = "expected a checkpoint with a preference head, got rfm_frames; compare final progress with rfm-client score"
+    with (
+        RewardClient("", transports=[Shelf(has_preference=False)]) as client,
+        pytest.raises(InvalidSampleError, match=f"^compare: {told}$"),
+    ):
+        compare(client, [str(video)] * 2, VideoOptions(task=TASK))
+
+
 def test_a_plot_has_a_strip_for_each_video_and_is_drawn_without_scores_too(tmp_path: Path) -> None:
     told = FrameScores(progress=np.linspace(0, 1, 12, dtype=np.float32), success=np.full(12, np.nan, np.float32))
     frames = np.random.default_rng(0).integers(0, 256, (12, 8, 8, 3), np.uint8)
@@ -295,7 +305,7 @@ def test_a_comparison_names_no_winner_where_the_orders_disagree(
     )
     assert (comparison.ranks, comparison.ranking) == (ranks, ranking)
     of_videos, of_pairs, *legend = comparison.tables()
-    shown = ranking or range(len(ranks))
+    shown = sorted(range(len(ranks)), key=lambda index: -comparison.wins[index])  # rank 3 stands in row 3
     expected = [(f"{index}", f"{index + 1}", str(ranks[index] or "?")) for index in shown]
     assert re.findall(r"^  (\d)\.npz +(\d) +(\S+)", of_videos, re.MULTILINE) == expected
     assert re.findall(r"  (agree|no answer)$", of_pairs, re.MULTILINE) == answers

@@ -26,6 +26,7 @@ DATASET = (
     "org/name[@revision], got"
 )
 PAIR = "expected a certificate and its key (PEM, unencrypted) at"
+EARLY = "early/checkpoint --image-encoder early/image_encoder --text-encoder early/text_encoder"
 SOURCE = "checkpoint: expected a folder that exists or a Hugging Face id org/name[/subfolder][@tag], got"
 
 
@@ -34,6 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A working folder with the files that the commands name."""
     folder = tmp_path_factory.mktemp("wrong")
     (folder / "empty").mkdir()
+    (folder / "early").symlink_to(ROOT / "examples" / "early_checkpoint")
     (folder / "repository").symlink_to(ROOT / "model_repository")
     shutil.copytree(LEROBOT / "toy_v21", folder / "dataset")
     for name in ("file.txt", "key.pem"):
@@ -148,8 +150,24 @@ FAILURES = {
     "rfm export file.txt --repository out": (1, f"{SOURCE} the file file.txt; name its folder, ."),
     "rfm export empty --repository out --name 'a b'": (1, "--name: expected letters, digits, _ and -, got 'a b'"),
     f"rfm models list --url {NOBODY}": (1, f"{NOBODY}: no connection: Connection refused: {STARTED}"),
-    "rfm try empty --task x": (1, "video: expected a video file, got a folder: name the videos in it (empty)"),
-    "rfm try nope.mp4 --task x": (1, "video: expected a video file, got none (nope.mp4)"),
+    "rfm serve early --as rewind": (
+        *(1, "repository: expected a folder of models, got early, a folder that holds a checkpoint: rfm serve "),
+        f"{EARLY} exports and serves it",
+    ),
+    "rfm serve --checkpoint early": (
+        *(1, "checkpoint: expected a checkpoint, got early, a folder that holds one; name "),
+        EARLY,
+    ),
+    "rfm try nope.mp4 --task x": (
+        *(1, "repository: expected a folder of models, got model_repository, which is not there: rfm export "),
+        "--checkpoint CHECKPOINT --repository model_repository writes one; --checkpoint robometer/Robometer-4B ",
+        "serves a public checkpoint",
+    ),
+    "rfm try empty --task x --repository repository": (
+        1,
+        "video: expected a video file, got a folder: name the videos in it (empty)",
+    ),
+    "rfm try nope.mp4 --task x --repository repository": (1, "video: expected a video file, got none (nope.mp4)"),
 }
 
 NO_TASK = 'task: expected a sentence with frames, got none: add --task "SENTENCE"'

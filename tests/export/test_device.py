@@ -80,7 +80,7 @@ def test_a_lack_of_gpu_memory_is_reported_in_one_line() -> None:
         raise torch.OutOfMemoryError(reason)
     assert str(error.value) == (
         "device: expected room on cuda:0 to compare the export with the checkpoint, got CUDA out of memory; "
-        "--device names another one"
+        "rfm export --device names another one"
     )
 
 
@@ -89,7 +89,7 @@ def test_the_command_says_where_it_compares(tmp_path: Path) -> None:
     words += ["--base-model", str(LARGE.base_model)]
     done = rfm(*words, "--num-gpus", "0", "--device", "cpu")
     assert done.exit_code == 0, done.output
-    assert "the export's scores are compared with the checkpoint's on cpu (--device names another one)" in done.output
+    assert "rfm: comparing the export's scores with the checkpoint's on cpu ...\n" in done.output
     refused = rfm(*words, "--device", "tpu")
     assert (refused.exit_code, "device: expected one of cpu" in refused.output) == (1, True)
 

@@ -31,7 +31,7 @@ PLAIN, VIDEO, POOLED, ADAPTER = (
 FRAMES = goldens.config("enc_c1_t1_disc10")
 OF_QWEN_3, OF_QWEN_2_5 = "Qwen3-VL-4B-Instruct", "Qwen2.5-VL-3B-Instruct"
 NEW_TOKENS = ("<|split_token|>", "<|reward_token|>", "<|pref_token|>", "<|sim_token|>", "<|prog_token|>")
-TOLD = "assumed, and not shown by the checkpoint: "
+TOLD = "not shown by the checkpoint: "
 
 Copy: TypeAlias = Callable[[str], tuple[Path, Path]]
 
@@ -120,7 +120,7 @@ def test_an_export_keeps_assumptions_and_versions_and_nothing_reads_them(tmp_pat
     rfm_export.export(FRAMES.checkpoint, tmp_path, settings, say=said.append, begin=begun.append)
     assert [step.partition(" ")[0] for step in begun] == ["reading", "writing", "comparing"]
     checkpoint = tmp_path / "rfm" / "1" / "checkpoint"
-    whose = {name: f"--{name}-encoder; weights of the checkpoint" for name in ("image", "text")}
+    whose = {name: f"--{name}-encoder; its weights are the checkpoint's" for name in ("image", "text")}
     assert json.loads((checkpoint / "provenance.json").read_text()) == {
         "assumed": [
             {"name": f"{name}_encoder", "value": f"encoders/{name}_encoder", "source": source}

@@ -118,7 +118,7 @@ def test_a_file_without_a_dtype_gets_a_line(tmp_path: Path) -> None:
     del content["dtype"]
     (folder / "config.json").write_text(json.dumps(content))
     (line,) = published.notes(folder, published.read(folder, reward_model="topreward"))
-    assert "assumed, and not shown by the checkpoint: dtype bfloat16 (default, as config.json has no dtype);" in line
+    assert "not shown by the checkpoint: dtype bfloat16 (default, as config.json has no dtype);" in line
 
 
 @pytest.mark.slow

@@ -151,7 +151,7 @@ def test_a_checkpoint_of_the_first_rewind_code_has_its_scores(first_code: tuple[
     assert lacking == "model.safetensors: there is no head of preference and success: served without"
     source = "(default of the first ReWiND code)"
     assert line.startswith(
-        "assumed, and not shown by the checkpoint: "
+        "not shown by the checkpoint: "
         f"num_attention_heads 8 {source}; causal_mask true {source}; max_len 16 {source}; scores differ"
     )
     random = np.random.default_rng(0)

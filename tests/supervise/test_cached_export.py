@@ -94,7 +94,7 @@ def test_an_export_is_kept_until_something_that_decides_it_changes(
             told = capsys.readouterr().err
             assert BEGINS in told
             assert "rfm: download: nothing for the checkpoint itself\n" in told
-            (note,) = [line for line in told.splitlines() if line.startswith("rfm: assumed, and not shown by")]
+            (note,) = [line for line in told.splitlines() if line.startswith("rfm: not shown by")]
             assert find_or_export(asked, cache) == repository
             served = f"rfm: {asked.checkpoint}: served from its export {repository}"
             assert capsys.readouterr().err.splitlines() == [note, served]
@@ -239,14 +239,14 @@ def test_a_start_says_what_it_takes_and_refuses_too_little_memory_before_the_dow
     with pytest.raises(ExportError) as refused:
         find_or_export(ExportConfig(checkpoint=source, num_gpus=0), cache)
     assert str(refused.value) == (
-        "memory: expected at least 38.0 GB, got 16.0 GB free; use a machine with more, or with a GPU; rfm export tries it all the same"
+        "memory: expected at least 38.3 GB, got 16.0 GB free; use a machine with more, or with a GPU; rfm export tries it all the same"
     )
     told = re.sub(r"[\d.]+ GB are free", "N GB are free", capsys.readouterr().err)
     assert told.splitlines() == [
         "rfm: download: 8.9 GB, about 10 minutes at 15 MB/s",
         f"rfm: disk: 8.9 GB in {hub_cache}; N GB are free",
         f"rfm: disk: 8.9 GB in {cache}; N GB are free",
-        "rfm: memory: about 50.7 GB to export, then 26.7 GB to serve; N GB are free",
+        "rfm: memory: about 51.1 GB to export, then 27.4 GB to serve; N GB are free",
         "rfm: no GPU: the CPU takes about 13 s for a sample with 8 frames of 224x224, by an estimate",
     ]
     assert not list(hub_cache.rglob("*.safetensors"))
@@ -257,8 +257,8 @@ LARGE = Found((), {"model.safetensors": 8_900_000_000})
 REFUSED = {
     "a disk": (0, 200, {"free": 8}, r"disk of .*: expected at least 8\.9 GB, got 8\.0 GB free; make room, or set XDG"),
     "a GPU": (8, 200, {}, r"GPU memory: expected at least 8\.9 GB, got 8\.0 GB free; --weights int8 halves them, or "),
-    "memory beside a GPU": (80, 12, {}, r"memory: expected at least 17\.4 GB, got 12\.0 GB free; use a machine"),
-    "memory beside a small GPU": (10, 30, {}, r"memory: expected at least 38\.0 GB, got 30\.0 GB free; use a mach"),
+    "memory beside a GPU": (80, 12, {}, r"memory: expected at least 17\.7 GB, got 12\.0 GB free; use a machine"),
+    "memory beside a small GPU": (10, 30, {}, r"memory: expected at least 38\.3 GB, got 30\.0 GB free; use a mach"),
     "nothing": (80, 20, {}, ""),
 }
 

@@ -41,6 +41,7 @@ class Shelf:
     after: int = sys.maxsize
     parts: Collection[str] = ("rfm", "rfm_encoder", "rfm_frames")
     has_encoder: bool = True
+    has_preference: bool = True
     url: str = "grpc://shelf:1"
     count: int = 0
     shapes: list[tuple[int, ...]] = field(default_factory=list)  # of the arrays in requests
@@ -73,6 +74,7 @@ class Shelf:
             video_dim=video_dim,
             text_dim=text_dim,
             trained_frames=now.max_frames,
+            has_preference=self.has_preference,
             frame_size=now.frame_size,
             weights_digest=now.weights,
             settings_digest=now.settings,

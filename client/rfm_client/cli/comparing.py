@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 from rfm_client.cli.options import VideoOptions
-from rfm_client.cli.scoring import Source, report_warnings
+from rfm_client.cli.scoring import Source, checkpoint_name, report_warnings
 from rfm_client.cli.show import at_end, number, table, title_at_end
 from rfm_client.client import RewardClient
 from rfm_client.contract.description import ModelInfo
@@ -21,7 +21,7 @@ from rfm_client.frames.fit_to_checkpoint import fitted, with_frame_indices
 
 LEGEND = (
     "no answer: the orders disagree, or both are exactly 0.5.\n"
-    "A video has no rank (?) if one of its pairs has no answer, or another wins as often."
+    "No rank (?): one of the video's pairs has no answer, or another wins as often."
 )
 
 
@@ -38,10 +38,11 @@ class Comparison(Ranking):
 
     def tables(self) -> list[str]:
         """Return a table of sources, best first, a table of pairs by number, and without a ranking a legend."""
+        best_first = sorted(self.numbers, key=self.wins.__getitem__, reverse=True)
         columns = ("video", "#", "rank", "P(wins)", title_at_end(self.scores[0]), "final success", "frames")
         pairs = ("first", "second", "P(first wins)", "order swapped", "mean", "orders")
         return [
-            table("", columns, [self._row(index) for index in self.ranking or self.numbers]),
+            table("", columns, [self._row(index) for index in best_first]),
             table("", pairs, [self._pair_row(*couple) for couple in self.couples()]),
             *([LEGEND] if self.ranking is None else []),
         ]
@@ -63,6 +64,9 @@ def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> 
     sources = [Source.read(name, video) for name in names]
     trajectories = [_of_one_task(sources[0], source) for source in sources]
     info = client.model_info(frames=trajectories[0].frames is not None)
+    if not info.has_preference:
+        remedy = "compare final progress with rfm-client score"
+        raise InvalidSampleError.at("compare", "a checkpoint with a preference head", checkpoint_name(info), remedy)
     limits = info.max_frames if video.subsample else None, info.frame_size if video.resize else None
     fits = [fitted(ProgressSample(trajectory), *limits) for trajectory in trajectories]  # once, not for every pair
     sent = [fit.sample.trajectories[0] for fit in fits]

@@ -115,7 +115,7 @@ def error_from(raised: Exception, url: str, bad_request: BadRequest = invalid_sa
                 return denied(url, "", str(raised))
             case "ClientResponseError":
                 return errors.InferenceFailedError(
-                    f"{url}: expected an answer of Triton's HTTP port (by default 8000), got {type(raised).__name__}; "
+                    f"{url}: expected an answer of Triton's HTTP port (by default 8000), got one in another protocol; "
                     "use grpc:// for its gRPC port"
                 )
             case "ClientConnectorError" | "OSError" | "EOFError" | "HTTPException":
