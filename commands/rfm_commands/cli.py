@@ -214,7 +214,7 @@ def serve(
         )
         beside = None if config.gateway.port is None else _beside(server, config, gateway_given)
         of_callers = api_key, None if beside is None else beside.api_key(os.environ)
-        require("admin key", admin_key not in of_callers, "another key than the callers'", "the same: make one of its own")
+        require("admin key", admin_key not in of_callers, "another than the callers' key", "the same: make its own")
         found = doors(endpoints, more_arguments, config.serve.status_port, beside, os.environ)
         asked = config.serve
         is_open = asked.grpc_certificate is not None and found["gRPC"][1] == NO_KEY

@@ -107,7 +107,7 @@ def test_callers_with_the_admin_key_are_refused(option: str, tmp_path: Path) -> 
     file.touch(0o600)
     file.write_text(API_KEY)
     done = rfm("serve", str(REPOSITORY), "--gateway-port", "8100", option, str(file), "--admin-key-file", str(file))
-    told = "rfm: admin key: expected another key than the callers', got the same: make one of its own\n"
+    told = "rfm: admin key: expected another than the callers' key, got the same: make its own\n"
     assert (done.exit_code, done.stderr) == (1, told)
 
 
