@@ -23,7 +23,7 @@ from tritonclient.grpc import InferenceServerClient
 from tritonclient.utils import InferenceServerException
 
 import clip
-from in_process import rfm_parsed
+from in_process import rfm, rfm_parsed
 from paths import ROOT
 from rfm_client import AccessDeniedError, RewardClient, ServerUnavailableError, Trajectory
 from servers import Endpoints, Quiet, serving, wait_for, web_server
@@ -139,6 +139,9 @@ def test_nginx_passes_on_the_requests_that_scoring_needs_with_a_key_and_nothing_
                 for refused in (asking.unload_model, asking.load_model, asking.get_trace_settings):
                     with pytest.raises(InferenceServerException, match="403"):
                         refused("rfm", headers=shown)
+            words = ["--repository", repository, "--url", f"grpcs://{address}", "--ca-file", authority]
+            done = rfm("models", "unload", "rfm", *map(str, words), "--api-key-file", str(papers / "keys/alice.key"))
+            assert done.stderr.endswith("status: 403: a proxy refuses this call: ask Triton's own port (--url)\n")
             with http(**shown) as caller:
                 for path in ("repository/models/rfm/unload", "systemsharedmemory/region/a/register", "../v2/logging"):
                     assert caller.post(f"/v2/{path}", json={}).status_code == 403
