@@ -23,6 +23,7 @@ from rfm.serve.supervisor import CrashLoopError, GatewayProcess, Supervisor
 from rfm.serve.triton_server import TritonServer, short_spin
 from rfm_client.cli.command import MOST_COLUMNS, OptionValues, with_options
 from rfm_client.contract.addresses import from_here
+from rfm_client.contract.checks import require
 from rfm_client.contract.process import raise_limit, write_log
 from rfm_client.contract.settings import ConfigError
 
@@ -196,6 +197,7 @@ def serve(
     write_log("rfm-serve", os.environ)
     if accept_known_vulnerabilities and not config.serve.is_loopback:
         logger.warning("%s is no loopback address, and %s", config.serve.host, ACCEPTED_WARNING)
+    admin_key = take_key(admin_key_file, os.environ) or new_key()
     endpoints = Endpoints.of(config.serve, config.gateway.port)
     installation = find_installation(tritonserver)
     folder = _served(word, repository, config.export, checkpoint_given)
@@ -207,13 +209,15 @@ def serve(
             installation,
             http_threads=config.serve.http_threads,
             log=lines,
-            admin_key=take_key(admin_key_file, os.environ) or new_key(),
+            admin_key=admin_key,
             api_key=api_key,
             accepts_known_vulnerabilities=accept_known_vulnerabilities,
             more_arguments=more_arguments,
             hang_s=config.serve.hang_s,
         )
         beside = None if config.gateway.port is None else _beside(server, config, gateway_given)
+        of_callers = api_key, None if beside is None else beside.api_key(os.environ)
+        require("admin key", admin_key not in of_callers, "another than the callers' key", "the same: make its own")
         found = doors(endpoints, more_arguments, config.serve.status_port, beside, os.environ)
         asked = config.serve
         is_open = asked.grpc_certificate is not None and found["gRPC"][1] == NO_KEY

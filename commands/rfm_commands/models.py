@@ -18,15 +18,13 @@ from typing import Annotated, ClassVar
 import typer
 
 from rfm.serve.access import take_key
-from rfm.serve.repository_api import RepositoryApi, RepositoryApiError
+from rfm.serve.repository_api import RepositoryApi
 from rfm_client.cli.command import CommandGroup, usage_errors, with_options
 from rfm_client.cli.options import CredentialFiles
 from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.settings import setting
 from rfm_commands.command import RfmCommand
 from rfm_commands.rollout import Rollout, check_files, models_of, previous_version
-
-SECURE = "grpcs://"
 
 app = typer.Typer(cls=CommandGroup, no_args_is_help=True)
 
@@ -45,11 +43,10 @@ class AdministeredServer(CredentialFiles):
     @contextmanager
     def connected(self) -> Iterator[RepositoryApi]:
         """Yield the server's repository API. Raises InvalidValueError, RepositoryApiError."""
-        if self.credentials.uses_tls and not self.url.startswith(SECURE):
-            raise RepositoryApiError.at("--url", f"{SECURE}host:port with certificates", self.url)
         options = self.credentials.grpc_options(self.url.partition(":")[0])
         key = take_key(self.admin_key_file, os.environ)
         with usage_errors("--url"):
+            self.credentials.check_url(self.url)
             if len(self.url.split()) > 1:
                 raise InvalidValueError(f"expected one server, got {self.url}")
             server = RepositoryApi(self.url, key, options, headers=self.credentials.shown)

@@ -137,7 +137,14 @@ def replace_config(repository: Path, config: pb.ModelConfig, scratch: Path) -> N
     new.write_text(render(config))
     newest_ns = max(path.lstat().st_mtime_ns for path in (new, model, *model.rglob("*")))
     os.utime(new, ns=(newest_ns, newest_ns + _STEP_NS))
-    new.replace(model / CONFIG_FILE)
+    _replace(model / CONFIG_FILE, new)
+
+
+def _replace(old: Path, new: Path) -> None:
+    """Put a file in another's place, with its mode: the server may be another user."""
+    if old.exists():
+        shutil.copymode(old, new)
+    new.replace(old)
 
 
 def publish(repository: Path, staged: Path, models: Sequence[GeneratedModel]) -> None:
@@ -163,7 +170,7 @@ def publish(repository: Path, staged: Path, models: Sequence[GeneratedModel]) ->
         for file in model.warmup_files:
             target = repository / model.name / WARMUP_FOLDER
             target.mkdir(exist_ok=True)
-            (staged / model.name / WARMUP_FOLDER / file).replace(target / file)
+            _replace(target / file, staged / model.name / WARMUP_FOLDER / file)
 
     parts = [model for model in replaced if not model.is_ensemble]
     for model in parts:

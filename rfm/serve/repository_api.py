@@ -164,6 +164,9 @@ class RepositoryApi:
             ours = triton.error_from(error, self._url)
             if isinstance(ours, ServerUnavailableError) and ours.remedy and message not in str(ours):  # no connection
                 raise RepositoryApiError(str(ours)) from error
+            if "http2 header with status: 403" in message:
+                remedy = "a proxy refuses this call: ask Triton's own port (--url)"
+                raise RepositoryApiError(f"{self._url}: {message}: {remedy}") from error
             is_server_s = str(error.status()) in _SERVER_STATUSES
             raise RepositoryApiError(f"{self._url}: {message}" if is_server_s else message) from error
 

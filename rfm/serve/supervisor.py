@@ -179,6 +179,8 @@ class Supervisor:
             if not self._is_to_stop.is_set():
                 raise
         finally:
+            if self._is_to_stop.is_set():
+                logger.info("stopping, after the requests in flight")
             self._status.record_down("it is stopping")
             if self.gateway is not None:  # before the server, so that requests in flight get answers
                 self.gateway.stop()

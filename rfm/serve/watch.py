@@ -55,6 +55,7 @@ class TritonWatch:
         self._counts: dict[str, str] = {}  # by series
         self._progress_s: dict[str, float] = {}  # when a model last made progress
         self._ready: dict[str, list[int]] = {}  # ready versions by model
+        self._seen: dict[str, list[int]] | None = None  # ready versions at the look before
         self._going: set[str] = set()  # models that are loading or unloading
         self._wanted: dict[str, int] = {}  # process count by model; excludes models that are loading
         self._leaving: set[str] = set()
@@ -125,6 +126,7 @@ class TritonWatch:
         self._going = loading | {entry.name for entry in versions if entry.state == UNLOADING}
         for model in ready:
             self._keep_up_with(model, ready[model])
+        self._log_changes()
         unloaded = ready.keys() - {entry.name for entry in versions if not entry.is_unloaded}
         for model in unloaded & self._leaving:
             self.served.pop(model, None)
@@ -148,6 +150,14 @@ class TritonWatch:
                 self._probes[model].has_answered = known  # a reloaded model stays ready
             self._ready[model] = ready
 
+    def _log_changes(self) -> None:
+        ready = dict(self._ready)
+        before, self._seen = ready if self._seen is None else self._seen, ready
+        for model in sorted(before.keys() | ready.keys()):
+            was, now = before.get(model, []), ready.get(model, [])
+            if was != now and not (was and {*was} < {*now}):  # in a rollout, both for a moment
+                logger.info("%s: serves version %s, before %s", model, *(_listed(each) for each in (now, was)))
+
     def _forget(self, model: str) -> None:
         """Stop probing a model that was reloaded or unloaded."""
         self._ready.pop(model, None)
@@ -166,3 +176,7 @@ class TritonWatch:
         parts = [step["model_name"] for step in steps if step["model_name"] in self.served]
         reasons = {part: self._reason(part, versions) for part in parts}
         return next((f"{part}: {reason}" for part, reason in reasons.items() if reason != NO_REASON), NO_REASON)
+
+
+def _listed(versions: Collection[int]) -> str:
+    return ", ".join(map(str, versions)) or "none"

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +26,13 @@ import clip
 from client_commands import MODEL, RFM_CLIENT, WIDTHS, ask, columns, invoke, rows, run
 from engine_server import EngineServer
 from gateways import running
-from in_process import rfm_client_app
+from in_process import rfm, rfm_client_app
 from proxies import Proxy
 from rfm_client import InvalidSampleError, RewardClient, ServerError, Trajectory
 from rfm_client.cli.bench import Load, measure
 from rfm_client.command_line import ExitCode
-from servers import Endpoints, RepositoryApi, Served, folder_server, wait_for
+from secured import Papers
+from servers import Endpoints, Quiet, RepositoryApi, Served, folder_server, wait_for, web_server
 from trajectories import random_trajectory
 from vlm import PLAIN as VLM
 
@@ -117,11 +119,15 @@ def test_status_shows_gpus_and_pending_requests(engines: EngineServer, tmp_path:
 
 
 def test_status_without_metrics_shows_the_rest_and_says_so(served: Served) -> None:
+    """At port 8002, another server may answer."""
     address = free_url()
-    result = invoke("status", "--url", served.url("http"), "--metrics-url", f"{address}/metrics")
-    assert result.exit_code == 0
-    told = f"no metrics of the machine: {address}/metrics: Connection refused: give their URL (--metrics-url)\n"
-    assert told in result.stdout
+    for words, told in (
+        ([], ""),
+        (["--metrics-url", f"{address}/metrics"], f" {address}/metrics: Connection refused:"),
+    ):
+        result = invoke("status", "--url", served.url("http"), *words)
+        assert result.exit_code == 0
+        assert f"no metrics of the machine:{told} give their URL (--metrics-url)\n" in result.stdout
     requests, batches = rows(result.stdout, f"{MODEL} ")
     assert batches[6] == "load"
     assert (requests[1:3], requests[5:]) == (["1", "READY"], ["-", "-"])
@@ -216,6 +222,31 @@ def test_wait_returns_when_the_model_is_ready_or_its_time_is_up(engines: EngineS
         result.stderr
         == f"rfm-client: {url}: rfm and rfm_frames: not ready within 0.2 s: {url}: no connection: Connection refused: {remedy}\n"
     )
+
+
+def test_wait_does_not_wait_for_a_server_that_wants_a_key() -> None:
+    """With a stand-in for a proxy before Triton."""
+
+    class Denied(Quiet, BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_error(401)
+
+    with web_server(Denied) as url:
+        result = invoke("wait", "--url", url, "--timeout", 600)
+    assert result.exit_code == ExitCode.FAILED
+    assert f"{url}: access denied: " in result.stderr
+    assert "show the key that it wants with api_key (--api-key-file)" in result.stderr
+
+
+def test_certificates_from_the_environment_beside_a_url_without_tls_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RFM_CA_FILE", str(Papers.issue(tmp_path).ca))
+    for application, words in ((invoke, ("status",)), (invoke, ("sample",)), (rfm, ("models", "list"))):
+        result = application(*words, "--url", "grpc://localhost:8001")
+        assert result.exit_code == ExitCode.USAGE
+        assert "expected grpcs:// or https:// with certificates, got grpc://localhost:8001" in result.stderr
+        assert "leave out ca_file (RFM_CA_FILE)" in result.stderr
 
 
 def test_an_interrupt_ends_it_without_a_traceback() -> None:

@@ -124,6 +124,19 @@ def changed_at(folder: Path) -> dict[Path, int]:
     return {file: file.stat().st_mtime_ns for file in folder.rglob("*") if file.is_file()}
 
 
+def test_files_that_an_export_replaces_keep_their_modes_because_the_server_may_be_another_user(tmp_path: Path) -> None:
+    export(tmp_path)
+    files = [tmp_path / "rfm" / "config.pbtxt", *(tmp_path / "rfm" / "warmup").iterdir()]
+    for file in files:
+        file.chmod(0o644)
+    umask = os.umask(0o077)
+    try:
+        assert export(tmp_path) == 2
+    finally:
+        os.umask(umask)
+    assert {f"{file.stat().st_mode & 0o777:o}" for file in files} == {"644"}
+
+
 def test_a_second_export_at_a_time_is_refused_and_the_next_removes_remains_of_a_killed_one(tmp_path: Path) -> None:
     """It touches no file of another model, which would make Triton load that again, too."""
     repository = tmp_path / "model_repository"

@@ -137,5 +137,6 @@ def test_metrics_count_requests_and_samples(tiny: Gateway) -> None:
     answered(ask_json(tiny, [progress(FIRST), preference(FIRST, SECOND), progress(SECOND)]))
     ask_npy(tiny, [progress(filmed(1, 2))])
     requests.get(f"{tiny.url}/nowhere")
+    requests.head(f"{tiny.url}/nowhere")  # a probe
     assert [after - b for after, b in zip(counts(), before, strict=True)] == [1, 1, 1, 2, 1, 1]
     assert tiny.metric("requests_in_flight") == 0

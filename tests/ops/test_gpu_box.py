@@ -23,7 +23,7 @@ from tritonclient.grpc import InferenceServerClient
 from tritonclient.utils import InferenceServerException
 
 import clip
-from in_process import rfm_parsed
+from in_process import rfm, rfm_parsed
 from paths import ROOT
 from rfm_client import AccessDeniedError, RewardClient, ServerUnavailableError, Trajectory
 from servers import Endpoints, Quiet, serving, wait_for, web_server
@@ -139,12 +139,16 @@ def test_nginx_passes_on_the_requests_that_scoring_needs_with_a_key_and_nothing_
                 for refused in (asking.unload_model, asking.load_model, asking.get_trace_settings):
                     with pytest.raises(InferenceServerException, match="403"):
                         refused("rfm", headers=shown)
+            words = ["--repository", repository, "--url", f"grpcs://{address}", "--ca-file", authority]
+            done = rfm("models", "unload", "rfm", *map(str, words), "--api-key-file", str(papers / "keys/alice.key"))
+            assert done.stderr.endswith("status: 403: a proxy refuses this call: ask Triton's own port (--url)\n")
             with http(**shown) as caller:
                 for path in ("repository/models/rfm/unload", "systemsharedmemory/region/a/register", "../v2/logging"):
                     assert caller.post(f"/v2/{path}", json={}).status_code == 403
             origin = {"host": "gpu-box.lan:8443", "origin": "https://gpu-box.lan:8443", "Sec-Fetch-Site": "same-origin"}
-            with http(**origin, **{"X-API-Key": bob}) as page:
-                assert page.post("/evaluate_batch", content=b"").status_code == 422  # like a wrong body
+            for url, headers in ((f"any:{bob}@{NAME}", {}), (NAME, {**origin, "X-API-Key": bob})):
+                answer = httpx.post(f"https://{url}:{port}/evaluate_batch", headers=headers, verify=context)
+                assert answer.status_code == 422  # like a wrong body
     log = (papers / "access.log").read_text()
     assert '"alice" "POST /inference.GRPCInferenceService/ModelInfer' in log
     assert not {key for key in (alice, bob) if key in log}
@@ -181,7 +185,7 @@ def test_keys_are_for_their_readers_alone_made_once_and_taken_back_one_by_one(pa
         assert (papers / name).stat().st_mode & 0o077 == 0, name
     keys, authority = papers / "etc/rfm/keys.map", (papers / "keys/ca.pem").read_bytes()
     before = keys.read_text()
-    assert [line.split()[2] for line in before.splitlines()] == ["alice;", "bob;"]
+    assert [line.split()[2] for line in before.splitlines()] == ["alice;", "alice;", "bob;", "bob;"]
     refused = shell("set +e\n" + commands("5. A key").partition("\n")[2], papers)
     assert "cannot overwrite existing file" in refused.stderr
     assert keys.read_text() == before
@@ -189,7 +193,7 @@ def test_keys_are_for_their_readers_alone_made_once_and_taken_back_one_by_one(pa
     assert (papers / "keys/ca.pem").read_bytes() == authority
     (command,) = re.findall("`(sudo sed .*?keys.map)`", GUIDE)
     assert shell(command, papers).returncode == 0
-    assert keys.read_text() == before.splitlines(keepends=True)[1]
+    assert keys.read_text().splitlines() == before.splitlines()[2:]
 
 
 def test_the_systemd_unit_runs_rfm_serve_as_nginx_and_the_guide_expect() -> None:

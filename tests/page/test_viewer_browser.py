@@ -529,7 +529,7 @@ Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts"].map(
     const names = [["rollout_seed_3_checkpoint_100k.mp4", 24], ["success.mp4", 4]].map((each) => cut(...each));
     const servers = [
       ["grpc://127.0.0.1:8001", "http://localhost:8100/"], ["grpc://localhost:8001", "https://gpu-box.lan:8443/"],
-      ["grpc://triton:8001", "https://gpu-box.lan:8443/"],
+      ["grpc://triton:8001", "https://gpu-box.lan:8443/", true],
     ].map((each) => serverOption(...each));
     const words = lerobotWords("delete", { name: named, kind: "LeRobot v3.0" }, [1], [0, 1]);
     const answer = { videos: [1, null, null, 4].map((rank) => ({ rank })), pairs: [{ verdict: null }, { verdict: "first" }] };
@@ -545,7 +545,8 @@ def test_modules_cut_names_name_a_reachable_triton_and_lead_a_line_over_skipped_
     dataset = "Ann's set; touch \n$(touch x)"
     markup, names, servers, words, sentences = page.browser.driver.execute_async_script(MODULES, dataset)
     assert names == ["rollout_seed…100k.mp4", "success.mp4"]
-    assert servers == [["--url", "grpc://127.0.0.1:8001"], [], ["--url", "grpc://triton:8001"]]
+    key = ["--api-key-file", "KEY_FILE"]
+    assert servers == [["--url", "grpc://127.0.0.1:8001"], [], ["--url", "grpc://triton:8001", *key]]
     assert shlex.split(words, comments=True)[:4] == ["lerobot-edit-dataset", "--repo_id", dataset, "--root"]
     assert sentences == [
         "a does the task best, but b, c have no rank: some answers depend on which video comes first.",

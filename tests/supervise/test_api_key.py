@@ -101,6 +101,16 @@ def test_a_second_key_for_callers_is_refused(option: str, apis: str, tmp_path: P
     assert f" --{option}" in done.stderr
 
 
+@pytest.mark.parametrize("option", ["--api-key-file", "--gateway-api-key-file"])
+def test_callers_with_the_admin_key_are_refused(option: str, tmp_path: Path) -> None:
+    file = tmp_path / "a.key"
+    file.touch(0o600)
+    file.write_text(API_KEY)
+    done = rfm("serve", str(REPOSITORY), "--gateway-port", "8100", option, str(file), "--admin-key-file", str(file))
+    told = "rfm: admin key: expected another than the callers' key, got the same: make its own\n"
+    assert (done.exit_code, done.stderr) == (1, told)
+
+
 def test_a_key_for_other_apis_stays() -> None:
     both = callers_restrictions("k", ["--grpc-restricted-protocol=health:a=b"])
     apis = "inference,shared-memory:authorization=Bearer k"

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import signal
@@ -229,8 +230,11 @@ def test_a_fault_of_a_load_counts_for_the_model_that_loads_and_is_part_of_no_cra
 
 
 @pytest.mark.slow
-def test_a_restart_serves_the_same_models_and_versions_and_no_newer_export(tmp_path: Path) -> None:
-    """Also what was loaded, and not what was unloaded."""
+def test_a_restart_serves_the_same_models_and_versions_and_no_newer_export(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Also what was loaded, and not what was unloaded, and the log tells both."""
+    caplog.set_level(logging.INFO)
     with supervised(tmp_path, "a", "b") as stage:
         stand_in_triton.repository(tmp_path, "c")
         httpx.post(f"{stage.serving.endpoints.http_url}/v2/repository/models/c/load")
@@ -248,6 +252,7 @@ def test_a_restart_serves_the_same_models_and_versions_and_no_newer_export(tmp_p
             assert "versions: 1" in stage.file(f"loaded-{model}").read_text()
         httpx.post(f"{stage.serving.endpoints.http_url}/v2/repository/models/a/load")
         assert stage.file("loaded-a").read_text() == config.read_text()  # a later load reads the repository's files
+    assert {"b: serves version none, before 1", "c: serves version 1, before none"} <= {*caplog.messages}
 
 
 @pytest.mark.parametrize(

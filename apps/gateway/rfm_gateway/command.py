@@ -31,7 +31,7 @@ class GatewayOptions(GatewayConfig):
     port: int | None = setting(DEFAULT_PORT, "Port to listen on.", least=1, most=MAX_PORT)
     host: str | None = setting(DEFAULT_HOST, "Address to listen on.")
     triton: str | None = setting(..., "grpc://host:port or http://host:port of Triton, with TLS grpcs:// or https://.")
-    metrics_url: str | None = setting(None, "URL of Triton's metrics. Default: port 8002 of the same host.")
+    metrics_url: str | None = setting(None, "URL of Triton's metrics. Default: port 8002 beside port 8000 or 8001.")
     model: str | None = setting(DEFAULT_MODEL, "Model name in the repository.")
 
 

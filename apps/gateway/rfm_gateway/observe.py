@@ -140,7 +140,8 @@ class RequestMiddleware:
         try:
             await self._app(scope, receive, send_counted)
         finally:
-            self._metrics.count(scope["path"], code, time.perf_counter() - started_s)
+            if scope["method"] != "HEAD":  # which rfm serve asks each second
+                self._metrics.count(scope["path"], code, time.perf_counter() - started_s)
 
 
 class CallerLeftError(Exception):

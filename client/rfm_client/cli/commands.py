@@ -161,7 +161,8 @@ def status(
     output: JsonOutput,
     server: StatusOptions,
     metrics_url: Annotated[
-        str | None, typer.Option(help="URL of the server's metrics. Default: /metrics on port 8002 of the same host.")
+        str | None,
+        typer.Option(help="URL of the server's metrics. Default: port 8002 beside port 8000 or 8001."),
     ] = None,
 ) -> None:
     """Show the server's models, requests, batches, GPUs and memory.
@@ -190,13 +191,14 @@ def status(
 @app.command(cls=Command, epilog=EXIT_CODES)
 @with_options
 def wait(server: WaitOptions) -> None:
-    """Wait until a server has the model ready, or --timeout passes.
+    """Wait until a server has the model ready, or --timeout passes. Fails at once if it denies access.
 
     Example: rfm-client wait --timeout 600
     """
     started_s = time.monotonic()
     try:
         with server.client() as client:
+            server.check_access()
             client.wait_ready(server.timeout_s)
     except DeadlineExceededError as error:
         remedy = "start a server there (rfm serve), name a model that it serves (--model), or wait longer (--timeout)"

@@ -21,7 +21,13 @@ from rfm_client.cli.command import STANDARD_OUTPUT, usage_errors
 from rfm_client.client import RewardClient
 from rfm_client.contract.checks import is_blank, require
 from rfm_client.contract.description import ModelInfo
-from rfm_client.contract.errors import InvalidSampleError, InvalidValueError, ModelNotFoundError, RewardError
+from rfm_client.contract.errors import (
+    AccessDeniedError,
+    InvalidSampleError,
+    InvalidValueError,
+    ModelNotFoundError,
+    RewardError,
+)
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, random_trajectory
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
 from rfm_client.contract.wire import DEFAULT_MODEL
@@ -30,6 +36,7 @@ from rfm_client.frames.orientation import ChannelOrder, Orientation
 from rfm_client.frames.sampling import RULES, Rule, Sampling
 from rfm_client.plot import MAX_CURVES, Size
 from rfm_client.transport.connection import Credentials
+from rfm_client.transport.servers import PROBE_TIMEOUT_S
 
 SampleType: TypeAlias = Literal["progress", "preference", "similarity"]
 
@@ -112,9 +119,9 @@ class ServerOptions(CredentialFiles):
                 raise first
             yield client
 
-    def _problem(self, url: str) -> RewardError | None:
+    def _problem(self, url: str, **options: Any) -> RewardError | None:
         """Return why a server does not score; None: it does."""
-        with self.client(url, retry=False) as client:
+        with self.client(url, retry=False, **options) as client:
             try:
                 try:
                     client.model_info()
@@ -139,6 +146,14 @@ class WaitOptions(ServerOptions):
     """Servers and model to wait for."""
 
     timeout_s: float = timeout_setting(120.0, "Time limit, in seconds.")
+
+    def check_access(self) -> None:
+        """Raise AccessDeniedError if all servers refuse this client, which no waiting changes."""
+        timeout_s = min(PROBE_TIMEOUT_S, self.timeout_s)
+        problems = (self._problem(url, timeout_s=timeout_s) for url in self.urls)
+        refusals = [each for each in problems if isinstance(each, AccessDeniedError)]
+        if len(refusals) == len(self.urls):
+            raise refusals[0]
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,8 @@ from tritonclient.utils import InferenceServerException
 from rfm_client.contract import errors, triton
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.description import ModelInfo
-from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.wire import Tensors
-from rfm_client.transport.connection import SECURE_SCHEMES, SILENT_S, Credentials
+from rfm_client.transport.connection import SILENT_S, Credentials
 from rfm_client.transport.limits import check_size, timeout
 from rfm_client.transport.shared_memory import SharedMemory
 
@@ -80,8 +79,7 @@ class TritonTransport:
         self._is_grpc = self._scheme.startswith("grpc")
         self.as_json = {"as_json": True} if self._is_grpc else {}  # makes the client's methods return dictionaries
         self._credentials = credentials or Credentials()
-        if self._credentials.uses_tls and self._scheme not in SECURE_SCHEMES:
-            raise InvalidValueError.at("url", "grpcs:// or https:// with certificates", url)
+        self._credentials.check_url(url)
         self._shared_memory = SharedMemory(url) if shared_memory else None
         self._client: Any = None  # tritonclient's, for the next call
         self._calls: Counter[Any] = Counter()  # by client; an earlier client closes after its last call

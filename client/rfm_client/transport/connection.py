@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from rfm_client.contract.addresses import check_authorities, host_of, is_loopback, load_certificate
+from rfm_client.contract.errors import InvalidValueError
 from rfm_client.contract.settings import ConfigError
 from rfm_client.contract.triton import AUTHORIZATION, bearer_headers
 
@@ -87,6 +88,12 @@ class Credentials:
     def uses_tls(self) -> bool:
         """True if there are certificates, which only TLS uses."""
         return self.ca_file is not None or self.client_certificate is not None
+
+    def check_url(self, url: str) -> None:
+        """Raise InvalidValueError for a URL without TLS beside certificates, which the environment may name."""
+        if self.uses_tls and url.partition("://")[0] not in SECURE_SCHEMES:
+            remedy = "without TLS leave out ca_file (RFM_CA_FILE) and client_certificate (RFM_CLIENT_CERTIFICATE)"
+            raise InvalidValueError.at("url", "grpcs:// or https:// with certificates", url, remedy)
 
     @property
     def options(self) -> dict[str, Any]:

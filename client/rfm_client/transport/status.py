@@ -24,6 +24,7 @@ from rfm_client.transport.calls import TritonTransport
 from rfm_client.transport.connection import Credentials
 
 METRICS_PORT = 8002
+_PORTS = ("8000", "8001")  # Triton's own, beside METRICS_PORT; other ports may be those of a second server on the host
 METRICS_OPTION = "--metrics-url"
 _PROCESSOR = "CPU"
 _FRAMES = frames_name("")  # ends the names of models for raw frames
@@ -151,7 +152,7 @@ class ServerStatus:
     version: str
     ready: bool
     models: tuple[ModelStatus, ...]
-    metrics_url: str
+    metrics_url: str | None
     metrics_error: str | None
     devices: tuple[Device, ...]
 
@@ -178,13 +179,16 @@ class ServerStatus:
     ) -> ServerStatus:
         """Return the status of the server at ``grpc://host:port`` or ``http://host:port`` (TLS: ``grpcs``, ``https``).
 
-        metrics_url: where to read metrics; None: port METRICS_PORT on the same host. Unreadable metrics are left out
+        metrics_url: where to read metrics; None: port METRICS_PORT on the same host, if the server has Triton's own
+            ports. Unreadable metrics are left out
         credentials: used for the server, not for the metrics
 
         Raises ServerUnavailableError, AccessDeniedError, DeadlineExceededError, and InferenceFailedError for an answer
         that is not Triton's.
         """
-        metrics_url = metrics_url or f"http://{split_url(url)[1].rpartition(':')[0]}:{METRICS_PORT}/metrics"
+        host, _, port = split_url(url)[1].rpartition(":")
+        if metrics_url is None and port in _PORTS:
+            metrics_url = f"http://{host}:{METRICS_PORT}/metrics"
         try:
             version, is_ready, models = await _state(url, timeout_s, credentials)
         except DeadlineExceededError as late:
@@ -262,10 +266,12 @@ def _whole(statistics: Mapping[str, Any], name: str, key: str) -> int:
     return int(statistics.get(name, {}).get(key, 0))
 
 
-def _read_metrics(url: str, timeout_s: float) -> tuple[_Metrics, str | None]:
+def _read_metrics(url: str | None, timeout_s: float) -> tuple[_Metrics, str | None]:
     """Return the metrics, and why there are none."""
     from prometheus_client.parser import text_string_to_metric_families
 
+    if url is None:
+        return [], f"no metrics of the machine: give their URL ({METRICS_OPTION})"
     try:
         with open_url(url, timeout_s) as answer:
             families = list(text_string_to_metric_families(answer.read().decode()))

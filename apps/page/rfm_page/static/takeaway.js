@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: MIT
 // What can be taken along: CSV, JSON, files, and the command lines that give the same numbers.
 
+import { hasKey } from "./api.js";
 import { commented, quoted } from "./shell.js";
 import { leadingOf } from "./signals.js";
 
@@ -127,9 +128,9 @@ function corrected({ orient, channels }, camera = "") {
   return [...turned, ...(channels === "rgb" ? [] : ["--channels", `${camera}${channels}`])];
 }
 
-/** The option that says where Triton is. On a loopback address only a page of the same machine reaches it. */
-export function serverOption(url, pageUrl = location.href) {
-  return LOOPBACK.test(url) && !LOOPBACK.test(pageUrl) ? [] : ["--url", url];
+/** The options that say where Triton is, and its key. On a loopback address only a page of the same machine reaches it. */
+export function serverOption(url, pageUrl = location.href, asksKey = hasKey()) {
+  return LOOPBACK.test(url) && !LOOPBACK.test(pageUrl) ? [] : ["--url", url, ...(asksKey ? ["--api-key-file", "KEY_FILE"] : [])];
 }
 
 /** Lets the browser save a file. */
