@@ -265,7 +265,7 @@ class AsyncRewardClient(ClientOptions, AsyncClosing, OneProcess):
 
     async def _why_unready(self) -> str:
         try:
-            await self._servers.model_info(frames_name(self.model), Deadline(PROBE_TIMEOUT_S))
+            await self._servers.first.model_info(frames_name(self.model), PROBE_TIMEOUT_S)  # without retries
         except (ServerUnavailableError, ModelNotFoundError) as error:  # waiting is the remedy
             return f": {error.fault or error}"
         except RewardError as error:

@@ -210,7 +210,9 @@ def test_scoring_with_a_model_that_is_not_served_fails_and_names_it(engines: Eng
     assert result.stderr.endswith(f": {remedy}\n")
 
 
-def test_wait_returns_when_the_model_is_ready_or_its_time_is_up(engines: EngineServer) -> None:
+def test_wait_returns_when_the_model_is_ready_or_its_time_is_up(
+    engines: EngineServer, caplog: pytest.LogCaptureFixture
+) -> None:
     result = ask(engines, "wait")
     assert result.exit_code == 0
     assert re.fullmatch(r"ready after \d+\.\d s\n", result.output)
@@ -222,6 +224,7 @@ def test_wait_returns_when_the_model_is_ready_or_its_time_is_up(engines: EngineS
         result.stderr
         == f"rfm-client: {url}: rfm and rfm_frames: not ready within 0.2 s: {url}: no connection: Connection refused: {remedy}\n"
     )
+    assert not caplog.messages  # of another time limit
 
 
 def test_wait_does_not_wait_for_a_server_that_wants_a_key() -> None:

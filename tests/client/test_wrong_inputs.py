@@ -181,7 +181,7 @@ AT_SERVER = {
     "score clip.npy --task x --model rfm_frames": (
         *(
             5,
-            "clip.npy: Request for unknown model: 'rfm_frames_frames' is not found; served: rfm, rfm_encoder, rfm_frames",
+            "clip.npy: Request for unknown model: 'rfm_frames_frames' is not found; served: rfm",
         ),
         ": give the checkpoint's name with model (--model)",
     ),

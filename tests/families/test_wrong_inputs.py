@@ -77,7 +77,7 @@ WRONG: dict[str, tuple[str, Sample, str]] = {
     "more frames in the second trajectory": (REWIND, PreferenceSample(embedded(1), embedded(9)), TOO_LONG),
     "frames of another width": (REWIND, ProgressSample(embedded(2, (13, 6))), "video_embeddings: expected float32 [T, 12], got [2, 13]"),
     "a task of another width": (REWIND, ProgressSample(embedded(2, (12, 7))), "text_embedding: expected float32 [6], got [7]"),
-    "frames without encoders": (REWIND, ProgressSample(filmed(1)), "frames: expected video_embeddings (no encoders are loaded), got frames"),
+    "frames without encoders": (REWIND, ProgressSample(filmed(1)), "frames: expected video_embeddings (no encoders are loaded), got frames: name the encoders with --image-encoder and --text-encoder"),
     "more tokens than the server takes": (REWIND, ProgressSample(embedded(8)), "num_frames: expected at most 16 tokens (max_sample_tokens of this server), got 17 tokens"),
     "a task that is too long": (ENCODED, ProgressSample(filmed(2, task="lift " * 100)), "task: expected at most 32 tokens (limit of the text encoder), got "),
     "a sliver": (ENCODED, ProgressSample(filmed(1, 1, 3000)), "frames: expected frames at most 50 times as long as wide, got 1 x 3000"),

@@ -103,7 +103,7 @@ def test_a_placeholder_is_no_task(tmp_path: Path, output: Path, text: str) -> No
     notes = Notes()
     report = label(open_dataset(root, task=TASK), BrightnessScorer(), LabelOptions(output=output, **FEW), notes)
     assert [item.episode.index for item in report.plan.items if item.episode.task == TASK] == [0, 6, 7]
-    assert "tasks: 3 episodes got --task, 5 kept their own" in notes.lines
+    assert "tasks: 3 episodes with that of --task, 5 with others" in notes.lines
     with pytest.raises(DatasetError, match="task: expected a sentence, got"):
         open_dataset(root, task=text)
 
@@ -157,7 +157,7 @@ def test_a_task_fills_the_files_of_a_folder_that_have_none(tmp_path: Path) -> No
     with pytest.raises(DatasetError, match='got none: add --task "SENTENCE"'):
         scorer.run(tmp_path, LabelOptions())
     assert scorer.run(tmp_path, LabelOptions(), task="open the drawer") is ExitCode.OK
-    assert "note: tasks: 1 episode got --task, 0 kept their own" in scorer.said
+    assert "note: tasks: 1 episode with that of --task, 0 with others" in scorer.said
     assert scorer.tasks == {TASK, "open the drawer"}
 
 

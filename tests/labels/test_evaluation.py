@@ -299,27 +299,35 @@ def test_no_number_is_cut_on_a_terminal_and_episodes_without_an_outcome_are_left
 ) -> None:
     curves = {0: RISING, 1: FALLING, 2: RISING, 3: FLAT, 4: RISING}
     names = ("a_long_name_of_a_model", "b")
-    files = [labels(tmp_path / f"{name}_progress.parquet", curves, curves, NAMES) for name in names]
-    outcomes = written(tmp_path / "a.csv", "episode,success\n0,1\n1 (2),0\nthree.mp4,0\n4,1\n9,1\ngone.mp4,1\n")
+    files = [labels(tmp_path / f"{name}_progress.parquet", curves, curves, NAMES) for name in names[:1]]
+    files.append(labels(tmp_path / "b_progress.parquet", {**curves, 8: FLAT}, None, NAMES))
+    labels(tmp_path / "copy_progress.parquet", {**curves, 8: FLAT}, None, NAMES)
+    outcomes = written(tmp_path / "a.csv", "Episode;success\n0;1\n1 (2);0\n\nthree.mp4;0\n4;1\n9;1\ngone.mp4;1\n")
     for name, value in {"COLUMNS": "80", "FORCE_COLOR": "1"}.items():  # as on a terminal
         monkeypatch.setenv(name, value)
     done = rfm_client("evaluate", tmp_path, "--outcome", outcomes, "--json", tmp_path / "out.json")
     assert done.exit_code == 0, done.output
     shown = re.sub(r"\x1b\[\d*m", "", done.stdout)
-    title = "4 episodes: 2 successes, 2 failures; 1 left out, whose outcome is unknown; "
+    title = (
+        "4 episodes: 2 successes, 2 failures; 1 left out, not in a_long_name_of_a_model (--labels chooses the files); "
+    )
+    title += "1 left out, whose outcome is unknown; "
     title += "2 outcomes unused, of episodes without labels: 9, gone.mp4 "
     assert title in " ".join(shown.split())
     document = json.loads((tmp_path / "out.json").read_text())
     assert (document["episodes"], document["num_without_outcome"]) == ([0, 1, 3, 4], 1)
     assert document["without_labels"] == [9, "gone.mp4"]
     assert [f"rfm-client: note: {note}" for note in document["notes"]] == done.stderr.splitlines() != []
+    assert document["notes"][0] == "copy: a copy of b"
+    assert "copy" not in shown
     assert max(map(len, shown.partition("VOC: ")[0].splitlines())) <= 80
     for name, found in zip(
         ("a_", r"b\b"), evaluate_labels(files, read_outcomes(outcomes, names=NAMES)).evaluations, strict=True
     ):
         told = re.findall(rf"(?m)^ +{name}.*(?:\n {{4}}.*)?", shown)  # a name may have a line of its own
-        assert found.final_of_successes is not None and found.by_success is not None
-        numbers = [found.final, found.final_of_successes, found.by_success.threshold]
+        best = found.by_success or found.by_progress
+        assert found.final_of_successes is not None and best is not None
+        numbers = [found.final, found.final_of_successes, best.threshold]
         assert {*(f"{number:.4f}" for number in numbers), f"{found.backwards:.1%}"} <= {*" ".join(told).split()}
 
 

@@ -138,6 +138,17 @@ def test_labels_of_a_video_hold_until_its_time_changes(tmp_path: Path, output: P
     assert labelled(root, output, **asked)[0] == EPISODE_FRAMES[4]
 
 
+def test_an_alias_that_a_later_run_leaves_behind_is_named_with_the_option_that_replaces_it(output: Path) -> None:
+    labelled(TOY, output, episodes=[0], alias="sarm_progress")
+    assert not any("sarm" in note for note in labelled(TOY, output, episodes=[0])[1])
+    _, notes = labelled(TOY, output, episodes=[0, 1])
+    added = "add --alias sarm_progress --overwrite to replace them there, too"
+    assert f"sarm_progress.parquet keeps the labels that this run replaces: {added}" in notes
+    _, notes = labelled(TOY, output, episodes=[0, 1], alias="sarm_progress", overwrite=True)
+    assert not any("keeps" in note for note in notes)
+    assert labels(output)["sarm_progress.parquet"] == labels(output)[PROGRESS]
+
+
 BY_OTHERS: dict[str, Callable[[Path], object]] = {
     "no Parquet file": lambda file: file.write_bytes(b"not ours"),
     "of LeRobot": lambda file: parquet.write_table(parquet.read_table(file).replace_schema_metadata({}), file),
@@ -178,11 +189,13 @@ def test_labels_are_listed_and_deleted_by_name_and_finished_episodes_stay(output
     assert labelled(TOY, output, episodes=[0])[0] == 0
     assert labels(output) == before
     (output / "third_progress.parquet").write_bytes(b"of another program")
+    labelled(TOY, output, name="wide", frames=3, episodes=[0])  # another recipe, which gives the same labels
     listed = rfm_client("label", TOY, "--output", output, "--list").stdout.splitlines()[2:]
     assert [line.split() for line in listed if line] == [
         ["rfm", "toy/brightness", "1", "-"],
         ["other", "toy/brightness", "1", "rfm"],
         ["third", "-", "-", "-"],
+        ["wide", "toy/brightness", "1", "rfm"],
     ]
     for parts in output.glob(".*_parts"):
         shutil.rmtree(parts)

@@ -105,7 +105,7 @@ def test_frames_before_the_first_subtask_get_the_callers_task(tmp_path: Path, ou
     assert dataset.episode(0).tasks == IN_TWO
     notes = Notes()
     label(dataset, BrightnessScorer(), LabelOptions(output=output, episodes=[0, 1], **FEW), notes)
-    assert "tasks: 2 episodes got --task, 0 kept their own" in notes.lines
+    assert "tasks: 2 episodes with that of --task, 0 with others" in notes.lines
 
 
 CANDIDATES = "expected one of task_index, annotation.human.coarse_action, language_persistent, got "

@@ -67,6 +67,15 @@ def test_videos_missing_from_the_table_are_listed(videos: Path, output: Path) ->
     assert not open_dataset(videos).notes
 
 
+def test_videos_in_deeper_folders_get_a_note_if_there_is_no_table(videos: Path) -> None:
+    (videos / ".hidden").mkdir()
+    (videos / ".hidden" / "c.mp4").write_bytes(b"of another program")
+    dataset = open_dataset(videos, task="open the box")
+    assert [episode.name for episode in dataset.episodes] == ["b.mp4"]
+    remedy = "list them in tasks.csv, or name them by a pattern (--videos)"
+    assert dataset.notes == [f"videos in deeper folders get no labels: day/a.mp4: {remedy}"]
+
+
 def test_all_faulty_lines_of_a_table_are_named_at_once(videos: Path) -> None:
     (videos / "tasks.csv").write_text("video,task\nb.mp4,a\n./b.mp4,b\nday/a.mp4,put it, and go\n ,c\n")
     with pytest.raises(DatasetError) as caught:
@@ -87,6 +96,10 @@ REFUSED = {
     "no column of tasks": ("video\nb.mp4\n", "expected the columns video and task, got video"),
     "no task": ("video,task\nb.mp4,\n", "b.mp4: expected a task as a sentence, got none"),
     "a task of blanks": ("video,task\nb.mp4,  \n", "b.mp4: expected a task as a sentence, got none"),
+    "a video without its suffix": (
+        "video,task\nday/a,open it\n",
+        "day/a: expected a folder of PNG or JPEG files, got none: write the whole name, a.mp4",
+    ),
     "a video that is missing": ("video,task\nc.mp4,a\n", "c.mp4: expected a video file, got none"),
 }
 

@@ -83,6 +83,7 @@ class LabelComparison:
     episodes: numbers of the shared episodes
     is_success: bool [E]; None: outcomes are unknown
     num_left_out: episodes that only some files have
+    lacking: names of the files that lack some of these episodes
     num_without_outcome: shared episodes left out because their outcome is unknown
     without_labels: episodes with an outcome that no file has, by number or name
     """
@@ -93,6 +94,7 @@ class LabelComparison:
     num_left_out: int
     num_without_outcome: int
     without_labels: Sequence[int | str] = ()
+    lacking: Sequence[str] = ()
 
     @property
     def notes(self) -> list[str]:
@@ -147,7 +149,8 @@ def evaluate_labels(files: Sequence[Path], outcomes: Mapping[Any, bool | None] |
         for name, file in zip(names, files, strict=True)
     ]
     left_out = len(everywhere) - in_all, in_all - len(common)
-    return LabelComparison(evaluations, common, is_success, *left_out, without_labels)
+    lacking = [name for name, episodes in read.items() if len(episodes) < len(everywhere)]
+    return LabelComparison(evaluations, common, is_success, *left_out, without_labels, lacking)
 
 
 def _names(files: Sequence[Path]) -> list[str]:

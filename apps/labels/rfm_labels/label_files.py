@@ -17,6 +17,7 @@ from rfm_labels.datasets.dataset import SIGNALS_FOLDER
 from rfm_labels.datasets.faults import DatasetError, listed, require
 from rfm_labels.datasets.hdf5 import label_prefix
 from rfm_labels.datasets.lerobot_meta import INFO_FILE
+from rfm_labels.datasets.stored_files import digest_of
 from rfm_labels.metadata import (
     PROGRESS,
     SUCCESS,
@@ -86,6 +87,20 @@ def find_label_files(root: Path, folder: Path | None = None) -> list[Path]:
     got = f"{', '.join(prefix.rstrip('.') or 'others' for prefix in prefixes)}: name one of the HDF5 files"
     require(folder, is_one, "labels of one dataset", got)
     return files
+
+
+def equal_files(files: Sequence[Path]) -> dict[Path, Path]:
+    """Return the first file with the same labels for each file, for example the one that an alias copies."""
+    first: dict[str, Path] = {}
+    found = {}
+    for file in files:
+        try:
+            table = read_label_table(file)
+            key = digest_of(name.encode() + values_of(table[name]).tobytes() for name in table.column_names)
+        except DatasetError:  # no label file: equals itself
+            key = str(file)
+        found[file] = first.setdefault(key, file)
+    return found
 
 
 def reward_name(file: Path) -> str:

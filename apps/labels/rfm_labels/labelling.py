@@ -6,6 +6,7 @@ Finished episodes stay in the parts. A run replaces label files only if it repro
 
 from __future__ import annotations
 
+import glob
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -83,6 +84,9 @@ def planned(dataset: Dataset, scorer: Scorer, outputs: Outputs, watch: Watch = Q
                 raise DatasetError(problem, error.where) from error
             labels = f"its labels of {counted(len(file.digests), 'episode')} are" if file.digests else "it is"
             watch.note(f"--overwrite: {error}; {labels} replaced")
+    for alias in outputs.left_behind(plan) if options.shard is None else ():
+        remedy = f"add --alias {alias} --overwrite to replace them there, too"
+        watch.note(f"{outputs.prefix}{alias}.parquet keeps the labels that this run replaces: {remedy}")
     checked_episodes(dataset, options, watch)  # after the cheap refusals
     doubts = doubts_of_files(dataset, plan.episodes, plan.recipe.decoded_cameras) if writes else []
     for line in shortened([f"doubt: {doubt}" for doubt in doubts]):
@@ -175,6 +179,14 @@ class Outputs:
             label_of = replace(self.options, name=reward_name(Path(f"{alias}.parquet")))
             return replace(self, options=label_of).before() or [LabelFile.read(file)]
         return [LabelFile.read(path) for path in [*self.progress, *self.signals] if path.exists()]
+
+    def left_behind(self, plan: Plan) -> list[str]:
+        """Return the aliases, not asked for now, of existing labels that the plan replaces by others."""
+        planned = {item.episode.index: item.digest for item in plan.items}
+        replaced = [file.digests for file in self.before() if file.digests not in ({}, planned)]
+        others = sorted({*self.folder.glob(f"{glob.escape(self.prefix)}[!.]*.parquet")} - {*self.progress})
+        stale = [file for file in others if LabelFile.read(file).digests in replaced]
+        return [file.stem.removeprefix(self.prefix) for file in stale]
 
     def write(self, plan: Plan, labels: Any) -> list[Path]:
         """Write the labels, a table from ``Parts.read_all``, to all files, and return their paths. Raises OSError."""

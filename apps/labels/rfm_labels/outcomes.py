@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -16,6 +15,7 @@ from rfm_labels.datasets.hdf5 import is_hdf5
 from rfm_labels.datasets.hdf5_contents import demonstrations, opened_hdf5
 from rfm_labels.datasets.lerobot_meta import EPISODES_FILE, column_types, json_lines, read_table
 from rfm_labels.datasets.readers import is_reader, read_episodes
+from rfm_labels.datasets.tasks_table import read_csv
 
 _EPISODE, _SUCCESS = "episode", "success"  # columns in an outcomes CSV
 _MEANINGS = {
@@ -64,25 +64,20 @@ def read_outcomes(
 
 def _of_csv(file: Path, names: Mapping[int, str]) -> Stored:
     known = {text: number for number, name in names.items() for text in (name, named(number, name))}
-    try:
-        with file.open(newline="", encoding="utf-8-sig") as content:
-            table = csv.DictReader(content)
-            table.fieldnames = header = [name.strip() for name in table.fieldnames or ()]
-            rows = list(table)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DatasetError.at(file, "a CSV file", error) from error
-    got = ", ".join(header) if rows else "no rows"
-    require(file, bool(rows) and {_EPISODE, _SUCCESS} <= {*header}, f"the columns {_EPISODE} and {_SUCCESS}", got)
+    columns, rows = read_csv(file)
+    got = ", ".join(columns) if rows else "no rows"
+    require(file, bool(rows) and {_EPISODE, _SUCCESS} <= {*columns}, f"the columns {_EPISODE} and {_SUCCESS}", got)
     stored: dict[Any, tuple[str, Sequence[Any]]] = {}
-    for number, row in enumerate(rows, 2):
-        where, text = f"{file}: line {number}", (row[_EPISODE] or "").strip()
+    for where, cells in rows:
+        row = dict(zip(columns, cells, strict=False))
+        text = row.get(_EPISODE, "").strip()
         episode: Any = int(text) if text.isdecimal() else known.get(text, text)
         other = known.get(text, episode)
         either = f": write {named(other, text)} or {named(episode, names.get(episode))}" if other != episode else ""
         is_one = bool(text) and not either
         require(f"{where}: {_EPISODE}", is_one, "the number or name of one episode", f"{text!r}{either}")
         require(where, episode not in stored, "each episode once", f"{text} again")
-        stored[episode] = f"{where}: {_SUCCESS}", [row[_SUCCESS]]
+        stored[episode] = f"{where}: {_SUCCESS}", [row.get(_SUCCESS)]
     return stored
 
 

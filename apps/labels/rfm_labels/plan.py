@@ -402,7 +402,8 @@ def _task_lines(dataset: Dataset, episodes: Sequence[DatasetEpisode]) -> list[st
         lines.append(f"tasks: --task for all {counted(len(episodes), 'episode')}")
     elif given.text is not None:
         num_given = sum(any(task == given.text for task, _ in episode.stretches) for episode in episodes)
-        lines.append(f"tasks: {counted(num_given, 'episode')} got --task, {len(episodes) - num_given} kept their own")
+        num_others = len(episodes) - num_given
+        lines.append(f"tasks: {counted(num_given, 'episode')} with that of --task, {num_others} with others")
     known = dict.fromkeys(task for episode in episodes for task, _ in episode.stretches)
     words = [task for task in known if task.isascii() and len(task.split()) == 1]  # such as ``pick_place_cup``
     if words:

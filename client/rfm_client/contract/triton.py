@@ -76,7 +76,8 @@ _START = (
 _ONE_ADDRESS = "; or name 127.0.0.1: of localhost's addresses, IPv6 and IPv4, gRPC reports the fault of one alone"
 _GRPC_PORT = "give that port, or http:// for the HTTP port, or grpcs:// with TLS"
 _NAME = "give the checkpoint's name with model (--model)"
-_OF_PARTS = frames_name(frames_name("")), frames_name(encoder_name(""))  # ask for frames of NAME_frames, NAME_encoder
+_FRAMES, _ENCODER = frames_name(""), encoder_name("")
+_OF_PARTS = frames_name(_FRAMES), frames_name(_ENCODER)  # ask for frames of NAME_frames, NAME_encoder
 _SHOW_KEY = "none was shown, or another: show the key that it wants with api_key (--api-key-file) or headers"
 _TRUST = {
     "WRONG_VERSION_NUMBER": "use grpc:// or http:// for a server without TLS",
@@ -193,13 +194,13 @@ def unreachable(url: str, reason: str) -> errors.ServerUnavailableError:
 
 
 def not_served(model: str, message: str, served: Collection[str]) -> errors.ModelNotFoundError:
-    """Return the error for a missing model, with the served models' names and the remedy."""
+    """Return the error for a missing model, with the served checkpoints' names and the remedy."""
     remedy = _NAME
     if frames_name(model) in served:
         remedy = "this checkpoint takes no embeddings: give frames, and ask model_info(frames=True)"
     elif model in map(frames_name, served) and not model.endswith(_OF_PARTS):
         remedy = "this checkpoint takes embeddings alone: export it with --image-encoder and --text-encoder"
-    names = ", ".join(sorted(served)) or "none"
+    names = ", ".join(sorted({name.removesuffix(_FRAMES).removesuffix(_ENCODER) for name in served})) or "none"
     return _with_remedy(errors.ModelNotFoundError, f"{message}; served: {names}", remedy)
 
 

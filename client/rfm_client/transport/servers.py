@@ -121,6 +121,11 @@ class Servers:
     def __str__(self) -> str:
         return ", ".join(server.transport.url for server in self._servers)
 
+    @property
+    def first(self) -> Transport:
+        """The first server, for a single request."""
+        return self._servers[0].transport
+
     async def infer(
         self,
         model: str,

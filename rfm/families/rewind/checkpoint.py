@@ -84,7 +84,8 @@ class RewindCollator:
         check_type(sample, self.config)
         frame_steps = sample.frame_steps if isinstance(sample, ProgressSample) else 0
         if sample.trajectories[0].video_embeddings is None:
-            raise InvalidSampleError.at("frames", "video_embeddings (no encoders are loaded)", "frames")
+            remedy = "name the encoders with --image-encoder and --text-encoder"
+            raise InvalidSampleError.at("frames", "video_embeddings (no encoders are loaded)", f"frames: {remedy}")
         text = self._text(sample.trajectories[0])
         videos = [self._video(trajectory, frame_steps) for trajectory in sample.trajectories]
         if frame_steps:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 VOC = "VOC: rank correlation of progress with time, mean over {}. "
 BY_OUTCOME = (
     "AUROC: of success, by the vote of the last three frames, and of progress at the last frame; 0.5 is chance. "
-    "Threshold: of the vote, with the best balanced accuracy. "
+    "Threshold: of the vote, or else of progress, with the best balanced accuracy. "
 )
 FALLS = "Falls: steps on which progress falls by more than 0.01."
 
@@ -60,12 +60,16 @@ def evaluate(
     Example: rfm-client evaluate my_dataset --outcome outcomes.csv
     """
     from rfm_labels import DatasetError, evaluate_labels, find_label_files, read_outcomes
-    from rfm_labels.label_files import read_names
+    from rfm_labels.datasets.stored_files import digest_of
+    from rfm_labels.label_files import read_names, reward_name
 
     output.begin()
     if not dataset.exists():
         raise DatasetError.at(dataset, "a labelled dataset", "no file or folder of this name")
-    files = labels or find_label_files(dataset)
+    known: dict[str, Path] = {}
+    there = () if labels else find_label_files(dataset)
+    first = {file: known.setdefault(digest_of([file.read_bytes()]), file) for file in there}  # an alias is a copy
+    files = labels or list(dict.fromkeys(first.values()))
     if not files:
         expected = "label files, NAME_progress.parquet (rfm-client label), or --labels"
         raise DatasetError.at(dataset, expected, "none")
@@ -73,9 +77,11 @@ def evaluate(
     comparison = evaluate_labels(files, outcomes)
     if output.prints_tables:
         _print_tables(comparison)
-    for note in comparison.notes:
+    same = [f"{reward_name(file)}: a copy of {reward_name(each)}" for file, each in first.items() if file != each]
+    notes = [*same, *comparison.notes]
+    for note in notes:
         report(f"note: {note}")
-    output.write_json(document(comparison))
+    output.write_json(document(comparison) | {"notes": notes})
     if output.plot is not None:
         from rfm_labels.pictures import draw_evaluation
 
@@ -93,14 +99,15 @@ def _print_tables(comparison: LabelComparison) -> None:
         if known is not None:
             aurocs = [None if ranking is None else ranking.auroc for ranking in (each.by_success, each.by_progress)]
             cells += map(number, (each.final_of_successes, each.final_of_failures, *aurocs))
-            best = each.by_success
+            best = each.by_success or each.by_progress
             cells += ["-", "-"] if best is None else [_exact(best.threshold), number(best.balanced_accuracy)]
         rows.append([*cells, f"{each.backwards:.1%}"])
     counts = counted(len(comparison.episodes), "episode")
     if known is not None:
         counts += f": {counted(int(known.sum()), 'success')}, {counted(int((~known).sum()), 'failure')}"
     if comparison.num_left_out:
-        counts += f"; {comparison.num_left_out} left out, which not all files have"
+        lacking = first_names(comparison.lacking)
+        counts += f"; {comparison.num_left_out} left out, not in {lacking} (--labels chooses the files)"
     if comparison.num_without_outcome:
         counts += f"; {comparison.num_without_outcome} left out, whose outcome is unknown"
     if comparison.without_labels:
@@ -120,4 +127,4 @@ def document(comparison: LabelComparison) -> dict[str, Any]:
     is_success = comparison.is_success
     evaluations = [{**asdict(each), "final_progress": each.final_progress.tolist()} for each in comparison.evaluations]
     arrays = {"is_success": None if is_success is None else is_success.tolist(), "evaluations": evaluations}
-    return asdict(comparison) | arrays | {"notes": comparison.notes}
+    return asdict(comparison) | arrays

@@ -24,7 +24,7 @@ from rfm_labels.datasets.hdf5 import label_prefix
 from rfm_labels.datasets.hub import ASK_BYTES, DownloadSize
 from rfm_labels.datasets.lerobot_frames import TOLERANCE_S
 from rfm_labels.datasets.opening import hdf5_files, open_dataset
-from rfm_labels.label_files import LabelFile, find_label_files, read_blank, reward_name
+from rfm_labels.label_files import LabelFile, equal_files, find_label_files, read_blank, reward_name
 from rfm_labels.labelling import Outputs, Report, planned
 from rfm_labels.labelling import label as label_dataset
 from rfm_labels.metadata import blank_lines
@@ -438,12 +438,11 @@ class LabelCommand:
 
     def _list(self) -> None:
         """List the labels that are there."""
-        rows, named = [], dict[object, str]()
-        for name, file in self._there().items():
-            each = LabelFile.read(file)
-            first = named.setdefault(tuple(each.digests.items()) or name, name)
-            same = "-" if first == name else first  # as an alias is
-            rows.append((name, each.checkpoint or "-", str(len(each.digests) or "-"), same))
+        there = self._there()
+        name_of, rows = {file: name for name, file in there.items()}, []
+        for file, first in equal_files(list(name_of)).items():
+            each, same = LabelFile.read(file), "-" if first == file else name_of[first]  # as an alias is
+            rows.append((name_of[file], each.checkpoint or "-", str(len(each.digests) or "-"), same))
         if rows:
             print_table("", ("labels", "checkpoint", "episodes", "equals"), rows)
         else:

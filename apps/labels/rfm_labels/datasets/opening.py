@@ -181,9 +181,18 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
         (kind, names), root, table, notes = _listed(path), path, path, []
         _check_tasks(path, task, _KINDS[kind][2])
         tasks = dict.fromkeys(names)
+        if kind == "videos" and (deeper := _deeper_videos(path)):
+            remedy = "list them in tasks.csv, or name them by a pattern (--videos)"
+            notes = [f"videos in deeper folders get no labels: {first_names(deeper)}: {remedy}"]
     shown, camera, _ = _KINDS[kind]
     episodes = (Episode(name, {camera: root / name}, own) for name, own in tasks.items())
     return EpisodeDataset(episodes, root, shown, table, task, corrections, notes)
+
+
+def _deeper_videos(folder: Path) -> list[str]:
+    """The videos below the folders in a folder, without hidden ones."""
+    found = (file.relative_to(folder) for file in folder.glob("*/**/*") if file.suffix.lower() in _VIDEO_SUFFIXES)
+    return sorted(file.as_posix() for file in found if not any(part.startswith(".") for part in file.parts))
 
 
 def _check_tasks(folder: Path, task: TaskOverride, episode: str) -> None:

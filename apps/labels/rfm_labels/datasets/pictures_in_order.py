@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 
-from rfm_client.options import counted
+from rfm_client.options import counted, first_names
 from rfm_labels.datasets.faults import DatasetError, require
 
 _NOT_IN_A_WORD = r"(?<![^\W_])"  # after a letter or digit, - and . are separators: frame-1.png, frame.1.png, 2026-11-26
@@ -144,7 +144,9 @@ def pictures_in(folder: Path) -> list[Path]:
     try:
         found = [each for each in folder.iterdir() if not each.name.startswith(".")]
     except OSError as error:
-        raise DatasetError.at(folder, "a folder of PNG or JPEG files", error.strerror) from error
+        alike = [each.name for each in folder.parent.glob("*") if each.stem == folder.name]
+        got = f"none: write the whole name, {first_names(sorted(alike))}" if alike else error.strerror
+        raise DatasetError.at(folder, "a folder of PNG or JPEG files", got) from error
     names = [each.name for each in found if is_picture(each)]
     folders = in_natural_order([each.name for each in found if each.is_dir()])
     got = f"an empty folder: {_LEAVE_OUT}" if not found else f"other files: {_LEAVE_OUT}"
