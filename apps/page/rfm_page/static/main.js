@@ -4,7 +4,7 @@
 import { aboutServer, compare, GatewayAway, hasKey, KeyWanted, score, served, ServerError, useKey } from "./api.js";
 import { Address } from "./address.js";
 import { Asking } from "./asking.js";
-import { Curve } from "./curves.js";
+import { Curve, failedOf } from "./curves.js";
 import { DatasetTab } from "./dataset.js";
 import { exampleFiles } from "./examples.js";
 import { failure, noModel, otherModel, serverAway, tritonAway, useRemedies } from "./faults.js";
@@ -499,8 +499,8 @@ function update() {
   const isByQuestion = byQuestion(curves);
   for (const video of videos.all) {
     const own = curves.filter((curve) => curve.video === video);
-    videos.mark(video, isByQuestion ? null : own[0]);
-    videos.tell(video, own.map(({ state }) => state));
+    videos.mark(video, isByQuestion || failedOf(own) === "failed" ? null : own[0]);
+    videos.tell(video, own);
   }
   showTable(page.curves, curves, Number(page.threshold.value));
   page.stop.disabled = queue.isIdle && !comparing;

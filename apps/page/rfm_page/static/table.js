@@ -44,7 +44,7 @@ function named(curve, name) {
   swatch.className = "swatch";
   swatch.style.background = curve.colour ?? `var(--${colourName(curve.index)})`; // of either theme
   header.title = name;
-  header.append(swatch, cut(name, NAME_LETTERS));
+  header.append(swatch, [cut(name, NAME_LETTERS), curve.asked && cut(curve.asked, NAME_LETTERS)].filter(Boolean).join(", "));
   return header;
 }
 
