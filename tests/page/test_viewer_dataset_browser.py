@@ -289,7 +289,7 @@ def test_two_label_files_are_overlaid_and_their_differences_listed(page: Page) -
     assert sorted(page.episodes) == np.flatnonzero(differs | (apart >= 0.3)).tolist()
     tick(page, "differ")
     page.at_rest(2)
-    assert page.browser["ends-told"].text.endswith(f" Note: {TOY}.")
+    assert page.browser["labels-warning"].text == TOY
     page.browser["made-box"].click()
     names, texts = ([each.text for each in page.browser.all(f"#made {tag}")] for tag in ("dt", "dd"))
     told = dict(zip(names, texts, strict=True))
@@ -474,7 +474,7 @@ def test_an_episode_is_scored_as_it_was_for_the_labels_and_one_without_labels_to
     page.open()
     page.choose(PLAIN)
     assert [row[4:] for row in page.rows] == [["-"] * 6] * 8
-    assert page.browser["count-never"].text == "-"
+    assert [page.browser[name].is_displayed() for name in ("only-never", "cutoff", "others")] == [False] * 3
     assert page.browser["no-labels"].text.splitlines()[-2:] == ["rfm-client label toy_v21", "Copy"]
     page.at_rest(1)
     assert page.numbers == []
@@ -597,25 +597,26 @@ def test_each_tab_opened_fresh_on_a_phone_shows_its_content_and_no_settings(page
         assert browser.run(IN_VIEW, ["episodes-title"])[0] > 0
         assert browser["order-told"].text == "No success, then most backward steps, then differing cameras"
         rows = browser.run("return document.getElementById('episodes').getBoundingClientRect()")
-        assert rows["top"] + 2 * 104 < size[1]
-        assert rows["height"] == 10 * 104
+        assert rows["top"] + 2 * 132 < size[1]
+        assert rows["height"] == 10 * 132
         assert browser.run(UNSEEN, "#episodes th button, #episodes .task", "tr") == []
         page.open_link("")
         browser.until("document.getElementById('model').value")
-        assert not browser["question"].is_displayed()
+        assert [browser[name].is_displayed() for name in ("tasks", "score", "model")] == [True, True, False]
         browser["fold"].click()
         browser.write("tasks", "put the red block in the bowl")
         browser.all("#examples > button")[0].click()
         browser.until_text("scored", "3 of 3 scored")
-        assert not browser["question"].is_displayed()  # it makes way for the curves
+        assert not browser["advanced"].is_displayed()  # the settings make way for the curves
+        assert min(browser.run(IN_VIEW, ["tasks", "score"])) > 0
         assert browser["compare"].is_displayed()
         browser.draw()
         assert browser.run(UNSEEN, "#videos .nameable button", "figcaption") == []
         assert browser.run(IN_VIEW, ["videos"])[0] > 0
-        assert browser["time-told"].text == "5.00 / 5.00 s"
+        assert browser["time-told"].text == "frame 16 of 16, 5.00 / 5.00 s"
         page.open_link("")
         browser.until("document.getElementById('model').value")
-        assert not browser["question"].is_displayed()
+        assert not browser["advanced"].is_displayed()
 
 
 FIRST, SECOND = "#tab=dataset&dataset=toy_v30_many", "#tab=dataset&dataset=toy_v21%7E2"  # the second of one name

@@ -49,7 +49,7 @@ export class Curve {
   }
 
   get sampling() {
-    const frames = this.sampledFrames === null ? [] : [`${this.sampledFrames} frames`];
+    const frames = this.sampledFrames === null ? [] : [`up to ${this.sampledFrames} frames`];
     return [this.rule, ...frames, ...corrections(this)].join(", ");
   }
 

@@ -297,6 +297,9 @@ export class DatasetTab {
     page["episode-list"].classList.toggle("beside", Boolean(other));
     page["episode-list"].classList.toggle("one-camera", this.#told.cameras.length < 2);
     page.ends.hidden = !this.#isLabelled;
+    page["dataset-panel"].classList.toggle("unlabelled", !this.#isLabelled);
+    page["labels-warning"].textContent = this.#told.warning ?? "";
+    page["dataset-told"].textContent = ` of ${this.#datasets[this.#number].name}`;
     if (this.#isLabelled || !this.#told.episodes.length) this.#places.labels.clear();
     else this.#places.labels.show(noLabels(this.#datasets[this.#number].name));
     const leftOut = Object.entries(this.#told.left_out).map(([camera, reason]) => `${short(camera)} is left out: ${reason}`);
@@ -458,7 +461,6 @@ export class DatasetTab {
     if (broken) told.push(`${broken} cannot be labelled now: see their tasks.`);
     if (judgedOnes.length) told.push(`${never} of ${judgedOnes.length} ${isWhole ? "episodes" : "of them"} never ${verb}.`);
     if (undone) told.push(`${undone} ${undone === 1 ? "succeeds, then undoes" : "succeed, then undo"} it.`);
-    if (this.#told.warning) told.push(`Note: ${this.#told.warning}.`);
     this.#page["ends-told"].textContent = told.join(" ");
     this.#histogram.show(labelled);
   }
@@ -492,6 +494,7 @@ export class DatasetTab {
     this.#page.episode.hidden = true;
     this.#page.datasets.classList.remove("watching");
     for (const name of ["score-episode", "episode-png", "episode-svg"]) this.#page[name].disabled = true;
+    this.#page["episode-png"].title = this.#page["episode-svg"].title = "Open an episode";
     this.#table.mark(null, []);
   }
 
@@ -569,6 +572,7 @@ export class DatasetTab {
     page["episode-legend"].replaceChildren(...curves.map(namedLine));
     Object.assign(this.#watched, { fps: told[0].fps, curves });
     page["episode-png"].disabled = page["episode-svg"].disabled = !curves.length;
+    page["episode-png"].title = page["episode-svg"].title = curves.length ? "" : "This episode has no labels";
     const found = await Promise.all(cameras.map((_, camera) => videoOf(this.#number, episode, camera, signal)));
     if (signal.aborted) return;
     if (!cameras.length) this.#places.episode.show(noVideo(() => this.#watch(this.#watched)));

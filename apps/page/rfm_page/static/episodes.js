@@ -25,7 +25,7 @@ const ORDERS = {
 };
 
 const PROGRESS = 4; // its column
-const NAMES = ["", "", "Task", "Frames", "Progress", "Best", "End", "Back", "Cameras", "Differ"]; // of columns, on a telephone
+const NAMES = ["", "", "Task", "Frames", "Final progress", "Best success", "Final success", "Backward steps", "Cameras disagree", "Labels differ"]; // of columns, on a telephone
 
 /** What a filter keeps, by name; the second argument is the number beside it */
 const FILTERS = {

@@ -16,7 +16,7 @@ export function useRemedies(told) {
 export function serverAway(error, retry) {
   return {
     title: "The server does not answer",
-    text: "It has stopped, or the network is down. If it does not come back, restart it with your options, for example:",
+    text: "It has stopped, or the network is down. If it does not come back, restart it as before:",
     command: remedies.start,
     details: error.message,
     buttons: [["Check now", retry]],

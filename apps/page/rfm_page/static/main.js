@@ -21,6 +21,7 @@ import { Tabs } from "./tabs.js";
 import { Timeline } from "./timeline.js";
 import { commands, csv, json, save } from "./takeaway.js";
 import { learn, toldAt } from "./signals.js";
+import { writeCommand } from "./text.js";
 import { addVerdict, ofOneFile, sentenceOf } from "./verdicts.js";
 
 const CURVES_AT_A_TIME = 3;
@@ -131,7 +132,10 @@ function showAnywhere(error) {
 
 /** Shows what is wrong on every tab, and begins again when the server is back. Says whether something of that kind is wrong. */
 function failedAnywhere(error) {
-  if (error instanceof GatewayAway) askingServer.begin();
+  if (error instanceof GatewayAway) {
+    places.away.clear(); // somebody asked: say it again, though it was closed
+    askingServer.begin();
+  }
   return showAnywhere(error);
 }
 
@@ -145,8 +149,8 @@ function chooseRule() {
   const model = gateway.models.find(({ name }) => name === page.model.value);
   if (model) page.rule.value = model.rule;
   page["one-view"].hidden = !model?.reads_views;
-  page.warning.textContent = model?.warning ? `${model.warning}; ${model.remedy}` : "";
-  page.warning.hidden = !model?.warning;
+  const [, command = "", about = ""] = model?.remedy?.match(/^(rfm \S+ \S+)(.*)/) ?? [];
+  page.warning.replaceChildren(...(model?.warning ? [`${model.warning}; `, Object.assign(document.createElement("code"), { textContent: command }), about] : []));
   page.threshold.parentElement.hidden = model?.has_success === false;
   showLimits();
 }
@@ -206,7 +210,8 @@ function showWhetherReady() {
   const isTaskThere = tasks().length > 0;
   if (isTaskThere || !videos.all.length) page["task-wanted"].textContent = "";
   page.score.disabled = !videos.all.length || !isTaskThere || !page.model.value;
-  page.score.title = page.score.disabled ? "Needs a task, a video, and a model that is served" : "";
+  const missing = [!videos.all.length && "a video", !isTaskThere && "a task"].filter(Boolean).join(" and ");
+  page.score.title = !page.score.disabled ? "" : missing ? `Add ${missing}` : "No model is served";
 }
 
 function form(fields, files) {
@@ -352,7 +357,9 @@ async function compareAll() {
   }
   comparing = null;
   update();
-  if (!signal.aborted) page.status.textContent = verdicts.slice(before).map(sentenceOf).join(" ");
+  if (signal.aborted) return;
+  page.status.textContent = "";
+  page["verdict-told"].textContent = verdicts.slice(before).map(sentenceOf).join(" ");
 }
 
 /** Shows a verdict, and scrolls to it. */
@@ -510,7 +517,7 @@ function update() {
   page.take.hidden = !scored.length && !answered().length;
   page.verdicts.hidden = !verdicts.length;
   page.png.disabled = page.svg.disabled = page.csv.disabled = !scored.length;
-  page.command.textContent = commands(gateway.url, scored, answered());
+  writeCommand(page.command, commands(gateway.url, scored, answered()));
   told();
   showWhetherReady();
   page.scored.textContent = curves.length ? howMany() : "";
