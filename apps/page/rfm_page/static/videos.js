@@ -109,10 +109,10 @@ export class Videos {
     else entry.swatch.style.background = `var(--${colourName(curve.index)})`;
   }
 
-  /** Says whether its curves failed, and of a video that this browser cannot show whether it was scored. */
+  /** Says whether all its curves failed, and of a video that this browser cannot show whether it was scored. */
   tell(entry, curves) {
     const state = ["done", "failed"].find((each) => curves.some((curve) => curve.state === each)) ?? "waiting";
-    entry.failed.textContent = failedOf(curves);
+    entry.failed.textContent = failedOf(curves) === "failed" ? "failed" : ""; // of some, the legend says it
     entry.trouble.textContent = UNSHOWN[state];
   }
 
