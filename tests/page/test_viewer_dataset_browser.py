@@ -221,7 +221,7 @@ def test_filters_keep_the_matching_episodes_and_show_their_number(page: Page) ->
     expected = {
         "succeed": (None, summary.voted_success >= 0.5),
         "never": (None, ~succeeds),
-        "low": (0.992, succeeds & (summary.final_progress < 0.992)),
+        "undone": (None, summary.outcomes["undo"]),
         "backwards": (7.5, 100 * summary.backwards >= 7.5),
         "apart": (0.018, summary.disagreement >= 0.018),
     }
@@ -330,6 +330,7 @@ def test_marked_outcomes_stay_and_evaluate_reads_them(page: Page) -> None:
     def watch_clip(name: str) -> None:
         browser.run(f"document.querySelector('#episodes tr:has([title^=\"{name}\"]) button').click()")
         browser.until(f"document.getElementById('episode-told').textContent.startsWith('{name}')")
+        browser.until("!document.getElementById('failed').disabled")
 
     page.choose(DEMO)
     assert not browser["outcomes"].is_enabled()
@@ -350,6 +351,29 @@ def test_marked_outcomes_stay_and_evaluate_reads_them(page: Page) -> None:
         watch_clip(name)
         ActionChains(browser.driver).send_keys(key).perform()
     assert evaluated(link, "failure.mp4,failure", "success.mp4,success") == ([0, 2], [False, True])
+
+
+def test_an_episode_that_does_not_come_has_an_error_no_curves_and_no_marks(page: Page) -> None:
+    browser = page.browser
+    page.choose(DEMO)
+    page.at_rest(1)
+    assert page.numbers
+    browser.driver.execute_cdp_cmd("Network.setBlockedURLs", {"urls": ["*/episodes/2?*"]})
+    browser.run("document.querySelector('#episodes tr[data-episode=\"2\"] button').click()")
+    browser.until_text("episode-title", "Episode 2")
+    assert page.numbers == []
+    told = browser.until("document.getElementById('episode-errors').innerText")
+    assert told.startswith("Episode 2 cannot be shown")
+    assert (page.numbers, browser["episode-legend"].text) == ([], "")
+    assert not browser["succeeded"].is_enabled()
+    ActionChains(browser.driver).send_keys("s").perform()
+    assert browser["outcomes"].text == "outcomes.csv (0 marked)"
+    browser.driver.execute_cdp_cmd("Network.setBlockedURLs", {"urls": []})
+    browser.all("#episode-errors .actions button")[0].click()
+    browser.until("!document.getElementById('succeeded').disabled")
+    assert len(page.numbers) == 3
+    assert browser["episode-errors"].text == ""
+    browser.complaints()  # of the request that was blocked
 
 
 def test_ten_thousand_episodes_are_a_few_rows_of_the_document(page: Page) -> None:
@@ -475,7 +499,8 @@ def test_an_episode_is_scored_as_it_was_for_the_labels_and_one_without_labels_to
     page.choose(PLAIN)
     assert [row[4:] for row in page.rows] == [["-"] * 6] * 8
     assert [page.browser[name].is_displayed() for name in ("only-never", "cutoff", "others")] == [False] * 3
-    assert page.browser["no-labels"].text.splitlines()[-2:] == ["rfm-client label toy_v21", "Copy"]
+    command, copy = page.browser["no-labels"].text.splitlines()[-2:]
+    assert (command.split(" --url ")[0], copy) == ("rfm-client label toy_v21", "Copy")
     page.at_rest(1)
     assert page.numbers == []
     page.score_episode()
@@ -648,17 +673,17 @@ def test_back_and_forward_go_through_tabs_datasets_and_episodes(page: Page) -> N
 def test_a_link_shows_a_colleague_the_same_episode_and_settings(page: Page) -> None:
     browser = page.browser
     page.choose(BRIGHT)
-    tick(page, "low", 0.7)
+    tick(page, "backwards", 0)
     browser.write("task-part", "block")
     Select(browser["order"]).select_by_value("task")
     page.watch(1)
-    link = f"{SECOND}&order=task&low=0.7&contains=block&episode=1"
+    link = f"{SECOND}&order=task&backwards=0&contains=block&episode=1"
     page.has(link)
     told = browser["shown-told"].text
     page.open_link(link)
     browser.until_text("episode-title", "Episode 1")
     assert (browser["dataset"].get_attribute("value"), browser["shown-told"].text) == (f"{BRIGHT}", told)
-    assert (browser["only-low"].is_selected(), browser["order"].get_attribute("value")) == (True, "task")
+    assert (browser["only-backwards"].is_selected(), browser["order"].get_attribute("value")) == (True, "task")
     browser.driver.refresh()
     browser.until_text("episode-title", "Episode 1")
     page.has(link)

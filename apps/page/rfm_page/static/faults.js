@@ -3,13 +3,15 @@
 
 import { ServerError } from "./api.js";
 import { quoted } from "./shell.js";
+import { datasetWords, serverOption } from "./takeaway.js";
 
 const BY_ITSELF = "Checking automatically.";
 let remedies = {}; // command lines of this server, by what is missing
+let tritonUrl = "";
 
-/** From now on, states name the command lines of this server. */
-export function useRemedies(told) {
-  remedies = told;
+/** From now on, states name the command lines of this server, and Triton's address. */
+export function useRemedies(told, url) {
+  [remedies, tritonUrl] = [told, url];
 }
 
 /** The server that brought the page is away. */
@@ -71,12 +73,14 @@ export function noEpisode(retry) {
   };
 }
 
-export function noLabels(dataset) {
+/** dataset: name and kind; needsTask: an episode has none */
+export function noLabels(dataset, needsTask) {
+  const words = ["rfm-client", "label", ...datasetWords(dataset), ...serverOption(tritonUrl), ...(needsTask ? ["--task", "SENTENCE"] : [])];
   return {
     kind: "empty",
     title: "No labels",
-    text: "Label this dataset, then reload the page:",
-    command: `rfm-client label ${quoted(dataset)}`,
+    text: `Label this dataset${needsTask ? ", with what the robot does as the SENTENCE" : ""}, then reload the page:`,
+    command: words.map(quoted).join(" "),
   };
 }
 

@@ -70,7 +70,7 @@ async function askServer(isCurrent) {
   learn(about.scores); // before a tab draws a curve
   if (!isCurrent()) return true;
   if (!gateway.rules.length) offer(about);
-  useRemedies(about.remedies);
+  useRemedies(about.remedies, about.url);
   places.away.clear();
   page["key-form"].hidden = true;
   datasetTab.begin();
@@ -306,7 +306,10 @@ async function ask(curve, signal) {
     curve.state = "failed";
     curve.error = signal.aborted ? "stopped" : error.message;
     showEnds();
-    if (!signal.aborted) failed(error, `${video.name} could not be scored`, error instanceof ServerError ? scoreAll : null);
+    const faults = new Map(curves.filter((each) => each.error && each.error !== "stopped").map((each) => [each.name, each.error]));
+    if (faults.size > 1) error.message = [...faults].map(([name, fault]) => `${name}: ${fault}`).join("; ");
+    const title = faults.size > 1 ? `${faults.size} videos` : video.name;
+    if (!signal.aborted) failed(error, `${title} could not be scored`, error instanceof ServerError ? scoreAll : null);
   }
   setTimeout(update); // when the queue knows, too
 }
