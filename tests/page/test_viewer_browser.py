@@ -9,6 +9,7 @@ import itertools
 import json
 import re
 import shlex
+import subprocess
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -484,7 +485,7 @@ Object.defineProperty(window, "localStorage", { get() { throw new DOMException("
 """  # what Chromium does with cookies blocked
 
 
-def test_an_example_is_scored_with_a_click_also_where_the_browser_blocks_cookies(page: Page) -> None:
+def test_an_example_is_scored_with_a_click_also_where_the_browser_blocks_cookies(page: Page, tmp_path: Path) -> None:
     browser = page.browser
     blocking = browser.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": BLOCKED})
     try:
@@ -496,6 +497,10 @@ def test_an_example_is_scored_with_a_click_also_where_the_browser_blocks_cookies
         browser.until_text("scored", "1 of 1 scored")
         (shown,) = page.saved()["videos"]
         assert shown["progress"][-1] > 0.9
+        fetch, command = browser["command"].text.split(" && ")
+        subprocess.run(shlex.split(fetch), cwd=tmp_path, check=True)
+        (again,) = by_command_line(tmp_path, command)["videos"]
+        assert again["progress"] == pytest.approx(shown["progress"], abs=TOLERANCE)
     finally:
         browser.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", blocking)
 
@@ -528,7 +533,7 @@ def test_the_figure_fits_a_column_of_a_paper_and_is_light(page: Page) -> None:
 MODULES = """
 const [named, done] = arguments;
 Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts"].map((name) => import(`/viewer/${name}.js`))).then(
-  ([{ cut }, { serverOption }, { Curve }, { svgFigure }, { lerobotWords }, { sentenceOf }]) => {
+  ([{ cut }, { serverOption, datasetWords }, { Curve }, { svgFigure }, { lerobotWords }, { sentenceOf }]) => {
     const settings = { task: "lift", model: "m", rule: "all", fps: 1 };
     const curve = new Curve({ title: "a.mp4", id: 1 }, settings);
     curve.take("video", { num_frames: 7, times_s: null });
@@ -542,11 +547,13 @@ Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts"].map(
       ["grpc://127.0.0.1:8001", "http://localhost:8100/"], ["grpc://localhost:8001", "https://gpu-box.lan:8443/"],
       ["grpc://triton:8001", "https://gpu-box.lan:8443/"],
     ].map((each) => serverOption(...each));
+    const ways = ["LeRobot v3.0", "videos", "pattern {episode}/{camera} 1.mp4", "reader my.py:read"];
+    const datasets = ways.map((kind) => datasetWords({ name: "rec", kind }));
     const words = lerobotWords("delete", { name: named, kind: "LeRobot v3.0" }, [1], [0, 1]);
     const answer = { videos: [1, null, null, 4].map((rank) => ({ rank })), pairs: [{ verdict: null }, { verdict: "first" }] };
     const circle = { videos: [{ rank: null }, { rank: null }, { rank: null }], pairs: [{ verdict: "first" }] };
     const sentences = [answer, circle].map((each) => sentenceOf({ videos: [..."abcd"].map((title) => ({ title })), answer: each }));
-    done([figure, names, servers, words, sentences]);
+    done([figure, names, servers, datasets, words, sentences]);
   });
 """
 
@@ -554,9 +561,11 @@ Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts"].map(
 def test_modules_cut_names_name_a_reachable_triton_and_lead_a_line_over_skipped_frames(page: Page) -> None:
     """Of seven frames the model skips three, and the score of one is missing."""
     dataset = "Ann's set; touch \n$(touch x)"
-    markup, names, servers, words, sentences = page.browser.driver.execute_async_script(MODULES, dataset)
+    markup, names, servers, datasets, words, sentences = page.browser.driver.execute_async_script(MODULES, dataset)
     assert names == ["rollout_seed…100k.mp4", "success.mp4"]
     assert servers == [["--url", "grpc://127.0.0.1:8001"], [], ["--url", "grpc://triton:8001"]]
+    ways = [[], [], ["--videos", "{episode}/{camera} 1.mp4"], ["--reader", "my.py:read"]]
+    assert datasets == [["rec", *way] for way in ways]
     assert shlex.split(words, comments=True)[:4] == ["lerobot-edit-dataset", "--repo_id", dataset, "--root"]
     assert sentences == [
         "a does the task best, but b and c have no rank: some answers depend on which video comes first.",

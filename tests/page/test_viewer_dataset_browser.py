@@ -221,7 +221,7 @@ def test_filters_keep_the_matching_episodes_and_show_their_number(page: Page) ->
     expected = {
         "succeed": (None, summary.voted_success >= 0.5),
         "never": (None, ~succeeds),
-        "undone": (None, summary.outcomes["undo"]),
+        "undone": (None, summary.outcomes["succeed, then undo it"]),
         "backwards": (7.5, 100 * summary.backwards >= 7.5),
         "apart": (0.018, summary.disagreement >= 0.018),
     }
