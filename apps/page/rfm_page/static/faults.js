@@ -75,12 +75,12 @@ export function noEpisode(retry) {
 
 /** dataset: name and kind; needsTask: an episode has none */
 export function noLabels(dataset, needsTask) {
-  const words = ["rfm-client", "label", ...datasetWords(dataset), ...serverOption(tritonUrl), ...(needsTask ? ["--task", "SENTENCE"] : [])];
+  const words = ["rfm-client", "label", ...datasetWords(dataset), ...serverOption(tritonUrl)].map(quoted);
   return {
     kind: "empty",
     title: "No labels",
     text: `Label this dataset${needsTask ? ", with what the robot does as the SENTENCE" : ""}, then reload the page:`,
-    command: words.map(quoted).join(" "),
+    command: [...words, ...(needsTask ? ['--task "SENTENCE"'] : [])].join(" "),
   };
 }
 
