@@ -501,7 +501,12 @@ BROKEN: dict[str, tuple[str, bytes | None, str, str]] = {  # a file, the content
         "/0/episodes/2/videos/0",
         r"episode 2, row 0: .*: expected its frame at 9\.7000 s, got one at 9\.5000 s",
     ),
-    "no rows": ("data/chunk-000/file-000.parquet", None, "/0/episodes/2", "file-000.parquet: expected a Parquet file, got none"),
+    "no rows": (
+        "data/chunk-000/file-000.parquet",
+        None,
+        "/0/episodes/2",
+        "file-000.parquet: expected a Parquet file, got none",
+    ),
     "no labels": ("rfm_progress.parquet", b"no labels", "/0", "rfm_progress.parquet: expected a file of labels"),
 }
 
