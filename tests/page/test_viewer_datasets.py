@@ -528,7 +528,7 @@ def test_a_dataset_that_breaks_says_why(
 def test_an_episode_that_cannot_be_read_hides_no_other(folders: list[Path], tmp_path: Path) -> None:
     root = Path(shutil.copytree(folders[V21], tmp_path / "spoilt"))
     (root / "data" / "chunk-000" / "episode_000001.parquet").write_text("junk")
-    with serving(root, folder_of_videos(tmp_path / "videos")) as get:
+    with serving(root, folder_of_videos(tmp_path)) as get:
         (tmp_path / "videos" / "1.mp4").write_text("junk")
         for number in range(2):
             rows, faults = get(f"/{number}").json()["episodes"], get(f"/{number}/faults").json()
