@@ -59,7 +59,7 @@ def test_a_page_goes_on_without_a_reload_when_triton_a_key_and_a_broken_dataset_
         browser["dataset-tab"].click()
         told = wait_for_state(browser, "no-datasets")
         assert told.startswith("No dataset yet")
-        assert f"rfm serve my_models --gateway-port {port} --gateway-dataset my_dataset" in told
+        assert f"rfm serve ... --gateway-port {port} --gateway-dataset my_dataset" in told
         middle = browser.run(
             "const box = document.querySelector('#no-datasets .state').getBoundingClientRect(); "
             "return (box.left + box.right) / 2 / innerWidth"

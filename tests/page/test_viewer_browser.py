@@ -9,6 +9,7 @@ import itertools
 import json
 import re
 import shlex
+import subprocess
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -41,6 +42,7 @@ CLIPS = {"success": ("success", 2_000_000), "failure": ("dropped", 2_000_001)}
 FPS = 10
 SIGNALS = ("progress", "success")
 PLAYERS = "#videos video, #time"  # the videos, then the slider
+VERDICT = "document.getElementById('verdict-told').textContent"
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,8 @@ def test_dropped_clips_get_the_curves_of_the_command_line(page: Page) -> None:
     for threshold in (0.5, 1.0):
         page.browser.enter("#threshold", threshold)
         first = [np.flatnonzero(np.array(video["success"]) >= threshold) for video in document["videos"]]
-        told = [f"{index[0] / FPS:.2f} s" if len(index) else "-" for index in first]
+        is_lost = [", then lost" if video["success"][-1] < threshold else "" for video in document["videos"]]
+        told = [f"{at[0] / FPS:.2f} s{lost}" if len(at) else "-" for at, lost in zip(first, is_lost, strict=True)]
         assert [row[7] for row in page.browser.cells("#curves tr")] == told
     (line,) = page.browser.all("#chart .threshold")
     height = page.browser.run("return document.querySelector('#chart .u-over').clientHeight")
@@ -266,7 +269,7 @@ def test_several_videos_are_ranked_as_by_the_command_line(page: Page) -> None:
     best_first = sorted(told["videos"], key=lambda video: -video["wins"])
     assert page.browser.run("return [...document.querySelectorAll('#pairs li')].map((item) => item.textContent)") == [
         (f"{video['rank']} {video['source']}" if video["rank"] else f"{video['source']} (no rank)")
-        + f"wins {video['wins']:.3f}"
+        + f"mean preference {video['wins']:.3f}"
         for video in best_first
     ]
     widths = page.browser.run(
@@ -298,8 +301,8 @@ def test_a_pair_is_compared_in_both_orders(page: Page) -> None:
     assert page.browser.all("#pairs p")[0].text == f"{TASK}, judged by rfm. Both orders agree."
     (pair,) = answer["pairs"]
     assert (pair["verdict"], pair["orders_agree"]) == ("first", True)
-    status = page.browser["status"]
-    assert (status.text, status.aria_role) == ("success.mp4 does the task better.", "status")
+    page.browser.until(f"{VERDICT} === 'success.mp4 does the task better.'")
+    assert page.browser["verdict-told"].aria_role == "status"
     before = page.saved()
     page.browser["clear"].click()
     page.browser.until_text("status", "Cleared 2 videos.")
@@ -311,7 +314,7 @@ def test_a_pair_is_compared_in_both_orders(page: Page) -> None:
     page.drop("copy")
     page.browser.until_text("scored", "2 of 2 scored")
     page.browser["compare"].click()
-    page.browser.until_text("status", "success.mp4 and copy.mp4 are one file, so neither is better.")
+    page.browser.until(f"{VERDICT} === 'success.mp4 and copy.mp4 are one file, so neither is better.'")
     assert page.saved()["comparisons"] == []
 
 
@@ -331,15 +334,24 @@ def test_a_missing_task_or_a_broken_video_is_named_and_the_others_are_scored(pag
     kinds = "MP4, MOV, WebM, Matroska, Ogg or AVI"
     told = f"video: expected a file of the kind {kinds}, got another kind (broken.mp4)"
     page.browser.until_text("errors", f"broken.mp4 could not be scored\n{told}")
-    assert [row[-1] for row in page.browser.cells("#curves tr")] == [told, "done"]
+    assert [row[-1] for row in page.browser.cells("#curves tr")] == [told, "scored"]
+    assert [each.text for each in page.browser.all("#videos .failed")] == ["failed", ""]
     told = "This browser cannot show this file, and it was not scored: see the numbers below."
     page.browser.until(f"document.querySelector('#videos figure p').textContent === '{told}'")
     assert page.browser.all("#videos figure p")[0].is_displayed()
     assert not page.browser["compare"].is_displayed()  # of two videos one has failed
     page.drop("failure")
     page.browser.until_text("scored", "2 of 3 scored, 1 failed")
+    page.browser.write("fps", "5")
+    submit.click()
+    page.browser.until_text("scored", "4 of 6 scored, 2 failed")
+    files = ("broken.mp4", "success.mp4", "failure.mp4")
+    names = [f"{file}, {fps} fps" for fps in (FPS, 5) for file in files]
+    assert sorted(row[0] for row in page.browser.cells("#curves tr")) == sorted(names)
+    assert [each.text for each in page.browser.all("#legend .failed")] == ["1 failed"] * 2
+    page.browser.all("#legend .remove")[1].click()
     page.browser["compare"].click()
-    page.browser.until_text("status", "success.mp4 does the task better.")
+    page.browser.until(f"{VERDICT} === 'success.mp4 does the task better.'")
     page.browser.all("#videos .remove")[2].click()
     page.browser.all("#videos .remove")[0].click()
     assert page.browser["errors"].text == ""
@@ -473,7 +485,7 @@ Object.defineProperty(window, "localStorage", { get() { throw new DOMException("
 """  # what Chromium does with cookies blocked
 
 
-def test_an_example_is_scored_with_a_click_also_where_the_browser_blocks_cookies(page: Page) -> None:
+def test_an_example_is_scored_with_a_click_also_where_the_browser_blocks_cookies(page: Page, tmp_path: Path) -> None:
     browser = page.browser
     blocking = browser.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": BLOCKED})
     try:
@@ -485,6 +497,10 @@ def test_an_example_is_scored_with_a_click_also_where_the_browser_blocks_cookies
         browser.until_text("scored", "1 of 1 scored")
         (shown,) = page.saved()["videos"]
         assert shown["progress"][-1] > 0.9
+        fetch, command = browser["command"].text.split(" && ")
+        subprocess.run(shlex.split(fetch), cwd=tmp_path, check=True)
+        (again,) = by_command_line(tmp_path, command)["videos"]
+        assert again["progress"] == pytest.approx(shown["progress"], abs=TOLERANCE)
     finally:
         browser.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", blocking)
 
@@ -517,7 +533,7 @@ def test_the_figure_fits_a_column_of_a_paper_and_is_light(page: Page) -> None:
 MODULES = """
 const [named, done] = arguments;
 Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts"].map((name) => import(`/viewer/${name}.js`))).then(
-  ([{ cut }, { serverOption }, { Curve }, { svgFigure }, { lerobotWords }, { sentenceOf }]) => {
+  ([{ cut }, { serverOption, datasetWords }, { Curve }, { svgFigure }, { lerobotWords }, { sentenceOf }]) => {
     const settings = { task: "lift", model: "m", rule: "all", fps: 1 };
     const curve = new Curve({ title: "a.mp4", id: 1 }, settings);
     curve.take("video", { num_frames: 7, times_s: null });
@@ -531,11 +547,13 @@ Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts"].map(
       ["grpc://127.0.0.1:8001", "http://localhost:8100/"], ["grpc://localhost:8001", "https://gpu-box.lan:8443/"],
       ["grpc://triton:8001", "https://gpu-box.lan:8443/", true],
     ].map((each) => serverOption(...each));
+    const ways = ["LeRobot v3.0", "videos", "pattern {episode}/{camera} 1.mp4", "reader my.py:read"];
+    const datasets = ways.map((kind) => datasetWords({ name: "rec", kind }));
     const words = lerobotWords("delete", { name: named, kind: "LeRobot v3.0" }, [1], [0, 1]);
     const answer = { videos: [1, null, null, 4].map((rank) => ({ rank })), pairs: [{ verdict: null }, { verdict: "first" }] };
     const circle = { videos: [{ rank: null }, { rank: null }, { rank: null }], pairs: [{ verdict: "first" }] };
     const sentences = [answer, circle].map((each) => sentenceOf({ videos: [..."abcd"].map((title) => ({ title })), answer: each }));
-    done([figure, names, servers, words, sentences]);
+    done([figure, names, servers, datasets, words, sentences]);
   });
 """
 
@@ -543,13 +561,15 @@ Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts"].map(
 def test_modules_cut_names_name_a_reachable_triton_and_lead_a_line_over_skipped_frames(page: Page) -> None:
     """Of seven frames the model skips three, and the score of one is missing."""
     dataset = "Ann's set; touch \n$(touch x)"
-    markup, names, servers, words, sentences = page.browser.driver.execute_async_script(MODULES, dataset)
+    markup, names, servers, datasets, words, sentences = page.browser.driver.execute_async_script(MODULES, dataset)
     assert names == ["rollout_seed…100k.mp4", "success.mp4"]
     key = ["--api-key-file", "KEY_FILE"]
     assert servers == [["--url", "grpc://127.0.0.1:8001"], [], ["--url", "grpc://triton:8001", *key]]
+    ways = [[], [], ["--videos", "{episode}/{camera} 1.mp4"], ["--reader", "my.py:read"]]
+    assert datasets == [["rec", *way] for way in ways]
     assert shlex.split(words, comments=True)[:4] == ["lerobot-edit-dataset", "--repo_id", dataset, "--root"]
     assert sentences == [
-        "a does the task best, but b, c have no rank: some answers depend on which video comes first.",
+        "a does the task best, but b and c have no rank: some answers depend on which video comes first.",
         "No best video: several win equally often.",
     ]
     svg = ElementTree.fromstring(markup)

@@ -221,7 +221,6 @@ def test_filters_keep_the_matching_episodes_and_show_their_number(page: Page) ->
     expected = {
         "succeed": (None, summary.voted_success >= 0.5),
         "never": (None, ~succeeds),
-        "low": (0.992, succeeds & (summary.final_progress < 0.992)),
         "backwards": (7.5, 100 * summary.backwards >= 7.5),
         "apart": (0.018, summary.disagreement >= 0.018),
     }
@@ -234,6 +233,15 @@ def test_filters_keep_the_matching_episodes_and_show_their_number(page: Page) ->
     page.browser.write("task-part", "GREEN")
     assert sorted(page.episodes) == [each.index for each in dataset.episodes if "green" in each.task]
     assert page.browser["shown-told"].text == f"{len(page.episodes)} of {len(dataset.episodes)}"
+    page.browser.write("task-part", " ")
+    page.choose(BRIGHT)
+    summary, cut = summarise(page.folders[BRIGHT] / "rfm_progress.parquet"), 0.72
+    assert summary.best_success is not None and summary.voted_success is not None
+    page.browser.enter("#cutoff", cut)
+    tick(page, "undone")
+    keep = (summary.best_success >= cut) & (summary.voted_success < cut)
+    assert sorted(page.episodes) == np.flatnonzero(keep).tolist() != []
+    assert page.browser["count-undone"].text == f"{keep.sum()}"
 
 
 def test_selected_episodes_are_taken_along(page: Page) -> None:
@@ -289,7 +297,7 @@ def test_two_label_files_are_overlaid_and_their_differences_listed(page: Page) -
     assert sorted(page.episodes) == np.flatnonzero(differs | (apart >= 0.3)).tolist()
     tick(page, "differ")
     page.at_rest(2)
-    assert page.browser["ends-told"].text.endswith(f" Note: {TOY}.")
+    assert page.browser["labels-warning"].text == TOY
     page.browser["made-box"].click()
     names, texts = ([each.text for each in page.browser.all(f"#made {tag}")] for tag in ("dt", "dd"))
     told = dict(zip(names, texts, strict=True))
@@ -330,6 +338,7 @@ def test_marked_outcomes_stay_and_evaluate_reads_them(page: Page) -> None:
     def watch_clip(name: str) -> None:
         browser.run(f"document.querySelector('#episodes tr:has([title^=\"{name}\"]) button').click()")
         browser.until(f"document.getElementById('episode-told').textContent.startsWith('{name}')")
+        browser.until("!document.getElementById('failed').disabled")
 
     page.choose(DEMO)
     assert not browser["outcomes"].is_enabled()
@@ -350,6 +359,30 @@ def test_marked_outcomes_stay_and_evaluate_reads_them(page: Page) -> None:
         watch_clip(name)
         ActionChains(browser.driver).send_keys(key).perform()
     assert evaluated(link, "failure.mp4,failure", "success.mp4,success") == ([0, 2], [False, True])
+
+
+def test_an_episode_that_does_not_come_has_an_error_no_curves_and_no_marks(page: Page) -> None:
+    browser = page.browser
+    page.choose(DEMO)
+    page.at_rest(1)
+    assert page.numbers
+    marked = browser["outcomes"].text
+    browser.driver.execute_cdp_cmd("Network.setBlockedURLs", {"urls": ["*/episodes/2?*"]})
+    browser.run("document.querySelector('#episodes tr[data-episode=\"2\"] button').click()")
+    browser.until_text("episode-title", "Episode 2")
+    assert page.numbers == []
+    told = browser.until("document.getElementById('episode-errors').innerText")
+    assert told.startswith("Episode 2 cannot be shown")
+    assert (page.numbers, browser["episode-legend"].text) == ([], "")
+    assert not browser["succeeded"].is_enabled()
+    ActionChains(browser.driver).send_keys("s").perform()
+    assert browser["outcomes"].text == marked
+    browser.driver.execute_cdp_cmd("Network.setBlockedURLs", {"urls": []})
+    browser.all("#episode-errors .actions button")[0].click()
+    browser.until("!document.getElementById('succeeded').disabled")
+    assert len(page.numbers) == 3
+    assert browser["episode-errors"].text == ""
+    browser.complaints()  # of the request that was blocked
 
 
 def test_ten_thousand_episodes_are_a_few_rows_of_the_document(page: Page) -> None:
@@ -474,8 +507,9 @@ def test_an_episode_is_scored_as_it_was_for_the_labels_and_one_without_labels_to
     page.open()
     page.choose(PLAIN)
     assert [row[4:] for row in page.rows] == [["-"] * 6] * 8
-    assert page.browser["count-never"].text == "-"
-    assert page.browser["no-labels"].text.splitlines()[-2:] == ["rfm-client label toy_v21", "Copy"]
+    assert [page.browser[name].is_displayed() for name in ("only-never", "cutoff", "others")] == [False] * 3
+    command, copy = page.browser["no-labels"].text.splitlines()[-2:]
+    assert (command.split(" --url ")[0], copy) == ("rfm-client label toy_v21", "Copy")
     page.at_rest(1)
     assert page.numbers == []
     page.score_episode()
@@ -597,25 +631,26 @@ def test_each_tab_opened_fresh_on_a_phone_shows_its_content_and_no_settings(page
         assert browser.run(IN_VIEW, ["episodes-title"])[0] > 0
         assert browser["order-told"].text == "No success, then most backward steps, then differing cameras"
         rows = browser.run("return document.getElementById('episodes').getBoundingClientRect()")
-        assert rows["top"] + 2 * 104 < size[1]
-        assert rows["height"] == 10 * 104
+        assert rows["top"] + 2 * 132 < size[1]
+        assert rows["height"] == 10 * 132
         assert browser.run(UNSEEN, "#episodes th button, #episodes .task", "tr") == []
         page.open_link("")
         browser.until("document.getElementById('model').value")
-        assert not browser["question"].is_displayed()
+        assert [browser[name].is_displayed() for name in ("tasks", "score", "model")] == [True, True, False]
         browser["fold"].click()
         browser.write("tasks", "put the red block in the bowl")
         browser.all("#examples > button")[0].click()
         browser.until_text("scored", "3 of 3 scored")
-        assert not browser["question"].is_displayed()  # it makes way for the curves
+        assert not browser["advanced"].is_displayed()  # the settings make way for the curves
+        assert min(browser.run(IN_VIEW, ["tasks", "score"])) > 0
         assert browser["compare"].is_displayed()
         browser.draw()
         assert browser.run(UNSEEN, "#videos .nameable button", "figcaption") == []
         assert browser.run(IN_VIEW, ["videos"])[0] > 0
-        assert browser["time-told"].text == "5.00 / 5.00 s"
+        assert browser["time-told"].text == "frame 16 of 16, 5.00 / 5.00 s"
         page.open_link("")
         browser.until("document.getElementById('model').value")
-        assert not browser["question"].is_displayed()
+        assert not browser["advanced"].is_displayed()
 
 
 FIRST, SECOND = "#tab=dataset&dataset=toy_v30_many", "#tab=dataset&dataset=toy_v21%7E2"  # the second of one name
@@ -647,17 +682,17 @@ def test_back_and_forward_go_through_tabs_datasets_and_episodes(page: Page) -> N
 def test_a_link_shows_a_colleague_the_same_episode_and_settings(page: Page) -> None:
     browser = page.browser
     page.choose(BRIGHT)
-    tick(page, "low", 0.7)
+    tick(page, "backwards", 0)
     browser.write("task-part", "block")
     Select(browser["order"]).select_by_value("task")
     page.watch(1)
-    link = f"{SECOND}&order=task&low=0.7&contains=block&episode=1"
+    link = f"{SECOND}&order=task&backwards=0&contains=block&episode=1"
     page.has(link)
     told = browser["shown-told"].text
     page.open_link(link)
     browser.until_text("episode-title", "Episode 1")
     assert (browser["dataset"].get_attribute("value"), browser["shown-told"].text) == (f"{BRIGHT}", told)
-    assert (browser["only-low"].is_selected(), browser["order"].get_attribute("value")) == (True, "task")
+    assert (browser["only-backwards"].is_selected(), browser["order"].get_attribute("value")) == (True, "task")
     browser.driver.refresh()
     browser.until_text("episode-title", "Episode 1")
     page.has(link)

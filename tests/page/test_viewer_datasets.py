@@ -501,7 +501,12 @@ BROKEN: dict[str, tuple[str, bytes | None, str, str]] = {  # a file, the content
         "/0/episodes/2/videos/0",
         r"episode 2, row 0: .*: expected its frame at 9\.7000 s, got one at 9\.5000 s",
     ),
-    "no rows": ("data/chunk-000/file-000.parquet", None, "/0", "file-000.parquet: expected a Parquet file, got none"),
+    "no rows": (
+        "data/chunk-000/file-000.parquet",
+        None,
+        "/0/episodes/2",
+        "file-000.parquet: expected a Parquet file, got none",
+    ),
     "no labels": ("rfm_progress.parquet", b"no labels", "/0", "rfm_progress.parquet: expected a file of labels"),
 }
 
@@ -518,6 +523,18 @@ def test_a_dataset_that_breaks_says_why(
         told = failure(get(path), 500)
         assert re.search(message, told), told
         assert str(tmp_path) not in told
+
+
+def test_an_episode_that_cannot_be_read_hides_no_other(folders: list[Path], tmp_path: Path) -> None:
+    root = Path(shutil.copytree(folders[V21], tmp_path / "spoilt"))
+    (root / "data" / "chunk-000" / "episode_000001.parquet").write_text("junk")
+    with serving(root, folder_of_videos(tmp_path)) as get:
+        (tmp_path / "videos" / "1.mp4").write_text("junk")
+        for number in range(2):
+            rows, faults = get(f"/{number}").json()["episodes"], get(f"/{number}/faults").json()
+            assert [row["episode"] for row in rows if row["num_frames"] == 0] == [1]
+            assert list(faults) == ["1"]
+            assert faults["1"] in failure(get(f"/{number}/episodes/1"), 500)
 
 
 def test_a_frame_of_another_size_is_refused_not_stretched(tmp_path: Path) -> None:
@@ -561,6 +578,7 @@ def test_names_and_tasks_are_shown_as_they_are_now_and_labels_follow_the_names(t
         assert {name: row["task"] for name, row in rows().items()} == {"0.mp4": "close it", "1.mp4": "open the drawer"}
         (first, *_) = label(open_dataset(root), BrightnessScorer(), LabelOptions()).files  # in the table's order
         for number, name in enumerate(("1.mp4", "0.mp4")):
+            assert (rows()[name]["episode"], get(f"/0/episodes/{number}").json()["name"]) == (number, name)
             progress = columns_of(root, number, first.name)["progress_sparse"]
             assert rows()[name]["final_progress"] == pytest.approx(float(progress[-1]))
             for part, points in (("", "curves"), ("/preview", "progress")):

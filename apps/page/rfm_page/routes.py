@@ -262,7 +262,7 @@ def _remedies(config: GatewayConfig, started_by: str) -> dict[str, str | bool]:
     port = str(config.address.port)
     is_beside = started_by == "rfm serve"
     start = (
-        f"{started_by} {_REPOSITORY} --gateway-port {port}"
+        f"{started_by} ... --gateway-port {port}"  # nobody tells the page what else it was started with
         if is_beside
         else f"{started_by} --triton {url} --port {port}"
     )

@@ -94,10 +94,10 @@ class ShownDataset:
         return self.fps if is_known else round(float((len(times_s) - 1) / times_s[-1]), 3)
 
     def read(self, reading: Callable[[ShownDataset], Read]) -> Read:
-        """Check the dataset, then read from it. Raises HTTPException 500 with the fault of a broken dataset."""
+        """Check the dataset, then read from it as it is now. Raises HTTPException 500 with a broken dataset's fault."""
         try:
             self.check()
-            return reading(self)
+            return reading(replace(self, dataset=self.dataset.as_now()))
         except DatasetError as error:
             raise HTTPException(500, self._without_folder(str(error))) from None
 
@@ -180,6 +180,7 @@ class ShownDataset:
             raise DatasetError.at(f"episode {number}: {file}", f"frames from 0 to {len(times_s) - 1}", "others")
         return {
             "episode": number,
+            "name": episode.own_name,
             "fps": self.rate(episode),
             "times_s": times_s.tolist(),
             "curves": [] if found is None else _curves(found, len(times_s)),

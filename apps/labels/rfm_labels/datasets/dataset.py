@@ -319,8 +319,22 @@ class Dataset(ABC):
 
     @property
     def listing(self) -> Sequence[DatasetEpisode]:
-        """Like ``episodes``, but with the tasks of now, and a Hub dataset downloads no row table."""
-        return self.episodes
+        """Like ``episodes``, but one that cannot be read has no frames, and a Hub dataset downloads no row table."""
+        return [self._listed(number) for number in self.numbers]
+
+    def _listed(self, number: int) -> DatasetEpisode:
+        try:
+            return self.episode(number)
+        except RewardError:  # raised again if that episode is read
+            return DatasetEpisode(number, self.name_of(number), "", 0, 0)
+
+    def name_of(self, number: int) -> str:
+        """Return an episode's name, also of one that cannot be read."""
+        return f"episode {number}"
+
+    def as_now(self) -> Dataset:
+        """Return the dataset, opened again if its folder lists other episodes or tasks. Raises DatasetError."""
+        return self
 
     def times_s(self, episode: DatasetEpisode) -> Times | None:
         """Return frame times from the episode's start, float64 [T]; None: unknown. Raises DatasetError."""

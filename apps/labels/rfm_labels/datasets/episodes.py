@@ -34,7 +34,6 @@ from rfm_labels.datasets.stored_files import (
     picture_frames,
     turn_mark,
 )
-from rfm_labels.datasets.tasks_table import TABLE, read_table_of_tasks
 
 Frames: TypeAlias = UInt8Array | str | Path | Sequence[str | Path] | Callable[[], Iterable[UInt8Array]]
 
@@ -220,7 +219,8 @@ class EpisodeDataset(RecordedDataset):
     """The episodes that a reader yields.
 
     root: folder with the recordings
-    where: the table of tasks, the folder that may get one, or the reader's name
+    where: the table of tasks, the folder that may get one, or the reader's name, for messages
+    reopen: opens the dataset again, for ``as_now``; None: it stays as it is
 
     Raises DatasetError for a name twice, functions that several episodes share, and too large arrays.
     """
@@ -234,9 +234,10 @@ class EpisodeDataset(RecordedDataset):
         task: TaskOverride,
         corrections: AskedCorrections,
         notes: Sequence[str] = (),
+        reopen: Callable[[], EpisodeDataset] | None = None,
     ) -> None:
         self.root, self.source, self.kind, self.given_task, self.notes = root, root.resolve().name, kind, task, notes
-        self._tasks_from = where
+        self._reopen, self._latest = reopen, self
         opened, names, recorded = lru_cache(_FILES_AT_A_TIME)(Video), set[str](), dict[int, Recorded]()
         num_bytes, functions, rates = 0, dict[object, str](), list[float | None]()
         variables: list[tuple[str, CellType, object]] = []
@@ -268,8 +269,13 @@ class EpisodeDataset(RecordedDataset):
         episode = super().read_episode(number)
         return replace(episode, task=" ".join(episode.task.split()))
 
+    def as_now(self) -> EpisodeDataset:
+        fresh = self if self._reopen is None else self._reopen()
+        if fresh.names_and_tasks != self._latest.names_and_tasks:
+            self._latest = fresh
+        return self._latest
+
     @property
-    def listing(self) -> Sequence[DatasetEpisode]:
-        table = self.root / TABLE if self._tasks_from == self.root else self._tasks_from
-        tasks = read_table_of_tasks(table, has_tasks=False) if isinstance(table, Path) and table.is_file() else {}
-        return [replace(each, task=tasks.get(each.name) or each.task) for each in self.episodes]
+    def names_and_tasks(self) -> list[tuple[str, str | None]]:
+        """The name and the task of each episode."""
+        return [(one.name, one.task) for one in self.recorded.values()]

@@ -150,7 +150,7 @@ class LeRobotDataset(Dataset):
     @property
     def listing(self) -> Sequence[DatasetEpisode]:
         if self._hub is None:
-            return self.episodes
+            return super().listing
         entries = map(self._entry, self.numbers)
         return [DatasetEpisode(each.index, each.where, " ".join(each.tasks[:1]), each.length, 0) for each in entries]
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from rfm_client.frames import ChannelOrder, Orientation
@@ -159,7 +160,7 @@ def hdf5_files(folder: str | Path) -> list[Path]:
     return [root / name for name in in_natural_order(names)]
 
 
-def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -> Dataset:
+def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -> EpisodeDataset:
     """Open a folder with one file or folder per episode, or its table. Raises DatasetError."""
     if path.is_file() and path.suffix.lower() != ".csv":
         raise DatasetError.at(path, _LAYOUTS, _unread(path) or "another file")
@@ -186,7 +187,8 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
             notes = [f"videos in deeper folders get no labels: {first_names(deeper)}: {remedy}"]
     shown, camera, _ = _KINDS[kind]
     episodes = (Episode(name, {camera: root / name}, own) for name, own in tasks.items())
-    return EpisodeDataset(episodes, root, shown, table, task, corrections, notes)
+    reopen = partial(_open_files, path, task, corrections)
+    return EpisodeDataset(episodes, root, shown, table, task, corrections, notes, reopen)
 
 
 def _deeper_videos(folder: Path) -> list[str]:
@@ -219,7 +221,8 @@ def _by_pattern(root: Path, pattern: str, task: TaskOverride, corrections: Asked
     episodes = (Episode(name, found[name], own) for name, own in tasks.items())
     notes = _notes(table, "episodes", [name for name in found if name not in tasks])
     where = table if table.is_file() else root
-    return EpisodeDataset(episodes, root, f"pattern {pattern}", where, task, corrections, notes)
+    reopen = partial(_by_pattern, root, pattern, task, corrections)
+    return EpisodeDataset(episodes, root, f"pattern {pattern}", where, task, corrections, notes, reopen)
 
 
 def _unlisted(table: Path, kind: str, names: Collection[str]) -> list[str]:

@@ -115,6 +115,9 @@ class RecordedDataset(CountedDataset):
             faults[number] = DatasetError.at(one.place, expected, got)
         raise faults[numbers[0]] if whole else FaultsError.of(faults, numbers)
 
+    def name_of(self, number: int) -> str:
+        return self.recorded[number].name
+
     def length(self, number: int) -> int:
         return self._measured(number)[1]
 

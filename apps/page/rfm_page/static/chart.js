@@ -10,7 +10,7 @@ import uPlot from "./uplot/uPlot.esm.js";
 export const NUM_COLOURS = 12;
 const LEFT_PX = 60; // of the numbers and names to the left
 const VALUE_PX = 16; // height of a number beside the chart
-const RIGHT_PX = 64; // of the numbers to the right; of several curves each with a piece of its line
+const RIGHT_PX = 64; // of the numbers at the end; of several curves each with a piece of its line
 const STUB_PX = 12; // length of such a piece
 const MOST_VALUES = 6; // of more curves those of one colour have numbers
 export const MARK_PX = 72; // at least between the marks of the axis below
@@ -151,12 +151,12 @@ export class Chart {
     const left = this.#plot.valToPos(seconds, "x");
     const isHidden = !Number.isFinite(left) || left < 0 || left > width + 1;
     this.#playhead.hidden = this.#values.hidden = this.#dots.hidden = isHidden;
-    this.#playhead.style.transform = `translateX(${left}px)`;
+    this.#playhead.style.transform = this.#values.style.transform = `translateX(${left}px)`;
     if (isHidden) return;
     this.#showValues(seconds);
   }
 
-  /** Writes the number of each curve to the right of the chart, at the height of its line if there is room. */
+  /** Writes the number of each curve to the right of the vertical line, at the height of its line if there is room. */
   #showValues(seconds) {
     const points = Object.keys(this.#panes).flatMap((signal) => this.#curves.map((curve) => {
       const index = pointAt(curve.times, seconds);

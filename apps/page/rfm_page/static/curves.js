@@ -32,6 +32,7 @@ export class Curve {
   colour = null; // that somebody gave its video, or its question
   dash = null; // lengths of strokes and gaps; null: a solid line
   title = null; // that somebody gave its question
+  asked = null; // the name of its question, if several need one beside their videos
   questionColour = null; // that somebody gave its question
   leaving = new AbortController(); // aborted as soon as the curve is removed
 
@@ -48,7 +49,7 @@ export class Curve {
   }
 
   get sampling() {
-    const frames = this.sampledFrames === null ? [] : [`${this.sampledFrames} frames`];
+    const frames = this.sampledFrames === null ? [] : [`up to ${this.sampledFrames} frames`];
     return [this.rule, ...frames, ...corrections(this)].join(", ");
   }
 
@@ -100,6 +101,12 @@ export class Curve {
     const index = this.success.findIndex((value) => value !== null && value >= threshold);
     return index < 0 ? null : this.times[index];
   }
+}
+
+/** How many of the curves failed, in words; "": none. */
+export function failedOf(curves) {
+  const failed = curves.filter(({ state }) => state === "failed").length;
+  return failed && failed < curves.length ? `${failed} failed` : failed ? "failed" : "";
 }
 
 /** What is changed in the frames of a video before they are scored. */

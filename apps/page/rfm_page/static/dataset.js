@@ -297,8 +297,11 @@ export class DatasetTab {
     page["episode-list"].classList.toggle("beside", Boolean(other));
     page["episode-list"].classList.toggle("one-camera", this.#told.cameras.length < 2);
     page.ends.hidden = !this.#isLabelled;
+    page["dataset-panel"].classList.toggle("unlabelled", !this.#isLabelled);
+    page["labels-warning"].textContent = this.#told.warning ?? "";
+    page["dataset-told"].textContent = ` of ${this.#datasets[this.#number].name}`;
     if (this.#isLabelled || !this.#told.episodes.length) this.#places.labels.clear();
-    else this.#places.labels.show(noLabels(this.#datasets[this.#number].name));
+    else this.#places.labels.show(noLabels(this.#datasets[this.#number], this.#told.episodes.some(({ task, num_frames: num }) => num && !task)));
     const leftOut = Object.entries(this.#told.left_out).map(([camera, reason]) => `${short(camera)} is left out: ${reason}`);
     page["left-out"].textContent = leftOut.join("; ");
     page["left-out"].hidden = !leftOut.length;
@@ -322,7 +325,8 @@ export class DatasetTab {
   }
 
   #failed(place, title, error, retry) {
-    if (!this.#failedAnywhere(error)) this.#places[place].show(failure(title, error, retry));
+    this.#failedAnywhere(error);
+    this.#places[place].show(failure(title, error, retry)); // which stays when the server is back
   }
 
   /** Judges all episodes by another threshold. */
@@ -427,6 +431,7 @@ export class DatasetTab {
 
   /** Marks the watched episode, for as long as the browser remembers; takes the same mark away. */
   #mark(outcome) {
+    if (!this.#watched.isLoaded) return; // nobody has seen it
     const mark = markOf(this.#watched);
     const isMarked = this.#outcomes.get(mark) === outcome;
     this.#readOutcomes(this.#outcomes); // another window may have marked some since
@@ -442,6 +447,7 @@ export class DatasetTab {
     const outcome = this.#watched && this.#outcomes.get(markOf(this.#watched));
     page.succeeded.setAttribute("aria-pressed", outcome === "success");
     page.failed.setAttribute("aria-pressed", outcome === "failure");
+    page.succeeded.disabled = page.failed.disabled = !this.#watched?.isLoaded;
     page.outcomes.textContent = `outcomes.csv (${length} marked)`;
     page.outcomes.disabled = !length;
   }
@@ -458,7 +464,6 @@ export class DatasetTab {
     if (broken) told.push(`${broken} cannot be labelled now: see their tasks.`);
     if (judgedOnes.length) told.push(`${never} of ${judgedOnes.length} ${isWhole ? "episodes" : "of them"} never ${verb}.`);
     if (undone) told.push(`${undone} ${undone === 1 ? "succeeds, then undoes" : "succeed, then undo"} it.`);
-    if (this.#told.warning) told.push(`Note: ${this.#told.warning}.`);
     this.#page["ends-told"].textContent = told.join(" ");
     this.#histogram.show(labelled);
   }
@@ -492,6 +497,7 @@ export class DatasetTab {
     this.#page.episode.hidden = true;
     this.#page.datasets.classList.remove("watching");
     for (const name of ["score-episode", "episode-png", "episode-svg"]) this.#page[name].disabled = true;
+    this.#page["episode-png"].title = this.#page["episode-svg"].title = "Open an episode";
     this.#table.mark(null, []);
   }
 
@@ -513,13 +519,15 @@ export class DatasetTab {
 
   async #watch(episode) {
     this.#leave();
-    this.#watched = { ...episode, files: [] };
+    this.#watched = { ...episode, files: [], isLoaded: false };
     const page = this.#page;
     const { signal } = this.#stopping;
     this.#places.episode.clear();
     this.#places.errors.clear();
     page.episode.hidden = false;
     this.#showOutcomes();
+    this.#showCurves([], []);
+    page["episode-chart"].setAttribute("aria-label", "No curves yet.");
     page.datasets.classList.add("watching");
     this.#table.mark(episode.episode, this.#shown);
     page["episode-title"].textContent = `Episode ${episode.episode}`;
@@ -542,8 +550,6 @@ export class DatasetTab {
     const place = this.#places.episode;
     const { size, asks } = await missingOf(this.#number, episode, signal);
     if (size === null || signal.aborted) return;
-    this.#timeline.show([]);
-    this.#page.motion.hidden = true;
     if (asks) await new Promise((accept) => place.show(downloading(episode, size, accept)));
     if (signal.aborted) return;
     place.show(downloading(episode, size));
@@ -559,16 +565,14 @@ export class DatasetTab {
     await this.#download(episode, signal);
     if (this.#told.is_on_hub) this.#table.refill(episode); // also after a download that went on without the page
     const told = await Promise.all(names.map((name) => curvesOf(this.#number, episode, name, signal)));
+    if (told[0].name !== this.#watched.name) throw new Error(`episode ${episode}: expected ${this.#watched.name}, got ${told[0].name}: reload the page`);
     const curves = [...curvesIn(told[0], null), ...told.slice(1).flatMap((each) => curvesIn(each, other).slice(0, 1))];
     this.#timeline.time = 0;
-    const motion = motionIn(told[0]);
-    page.motion.hidden = !motion.length;
-    page["motion-legend"].replaceChildren(...new Map(motion.map((curve) => [curve.label, namedLine(curve)])).values());
-    this.#timeline.show(curves.length ? curves : [emptyCurve(told[0])], motion);
+    this.#showCurves(curves, motionIn(told[0]), curves.length ? curves : [emptyCurve(told[0])]);
     page["episode-chart"].setAttribute("aria-label", describe(curves));
-    page["episode-legend"].replaceChildren(...curves.map(namedLine));
     Object.assign(this.#watched, { fps: told[0].fps, curves });
     page["episode-png"].disabled = page["episode-svg"].disabled = !curves.length;
+    page["episode-png"].title = page["episode-svg"].title = curves.length ? "" : "This episode has no labels";
     const found = await Promise.all(cameras.map((_, camera) => videoOf(this.#number, episode, camera, signal)));
     if (signal.aborted) return;
     if (!cameras.length) this.#places.episode.show(noVideo(() => this.#watch(this.#watched)));
@@ -583,8 +587,19 @@ export class DatasetTab {
     const reason = unused.every(Boolean) ? "Off: no camera of this episode has colours" // of no camera, too
       : found.some(({ isStored }, index) => !isStored && !unused[index])
         ? "Off: the page encodes these frames for the browser, which changes their scores slightly. Use rfm-client label." : "";
+    this.#watched.isLoaded = true;
+    this.#showOutcomes();
     Object.assign(this.#page["score-episode"], { disabled: reason !== "", title: reason });
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) this.#timeline.videos.play();
+  }
+
+  /** Shows the curves of an episode, and of its robot. drawn: with one that is not named */
+  #showCurves(curves, motion, drawn = curves) {
+    const page = this.#page;
+    page.motion.hidden = !motion.length;
+    page["motion-legend"].replaceChildren(...new Map(motion.map((curve) => [curve.label, namedLine(curve)])).values());
+    this.#timeline.show(drawn, motion);
+    page["episode-legend"].replaceChildren(...curves.map(namedLine));
   }
 
   /** The curves of the watched episode as a figure, whose legend has the names of the cameras. */
@@ -600,7 +615,8 @@ export class DatasetTab {
     const { corrections, cameras, unused } = this.#told;
     const { files, fps, task, episode } = this.#watched;
     const own = this.#told.provenance?.dataset?.task ? null : task; // else the command has to give it
-    const origins = cameras.map((camera) => ({ dataset: this.#datasets[this.#number].name, episode, camera, fps, task: own }));
+    const { name: dataset, kind } = this.#datasets[this.#number];
+    const origins = cameras.map((camera) => ({ dataset, kind, episode, camera, fps, task: own }));
     const used = (each) => each.filter((_, index) => !unused[index]);
     this.#onScore({ files: used(files), task, fps, corrections: used(corrections), origins: used(origins) });
   }

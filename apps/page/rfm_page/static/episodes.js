@@ -25,13 +25,13 @@ const ORDERS = {
 };
 
 const PROGRESS = 4; // its column
-const NAMES = ["", "", "Task", "Frames", "Progress", "Best", "End", "Back", "Cameras", "Differ"]; // of columns, on a telephone
+const NAMES = ["", "", "Task", "Frames", "Final progress", "Best success", "Final success", "Backward steps", "Cameras disagree", "Labels differ"]; // of columns, on a telephone
 
 /** What a filter keeps, by name; the second argument is the number beside it */
 const FILTERS = {
   succeed: ({ verdict }) => verdict === SUCCEEDS,
   never: ({ never_succeeds: never }) => never === true,
-  low: ({ never_succeeds: never, final_progress: final }, least) => never === false && isKnown(final) && final < least,
+  undone: ({ verdict }) => verdict === UNDONE,
   backwards: ({ backwards }, percent) => isKnown(backwards) && 100 * backwards >= percent,
   apart: ({ disagreement }, least) => isKnown(disagreement) && disagreement >= least,
   differ: ({ difference, verdict_differs: differs }, least) => differs === true || (isKnown(difference) && difference >= least),
@@ -56,9 +56,9 @@ export function judged(episodes, threshold, others) {
   });
 }
 
-/** The name of an episode, if it has one, and its task. */
-export function toldOf({ name, task }) {
-  return [name, task].filter(Boolean).join(": ");
+/** The name of an episode, if it has one, and its task, or that it has none. */
+export function toldOf({ name, task, num_frames: numFrames }) {
+  return [name, task || (numFrames ? "no task" : "")].filter(Boolean).join(": ");
 }
 
 /** Those that every filter keeps. chosen: [name, number] of each filter; text: a part of the name or the task */

@@ -3,20 +3,22 @@
 
 import { ServerError } from "./api.js";
 import { quoted } from "./shell.js";
+import { datasetWords, serverOption } from "./takeaway.js";
 
 const BY_ITSELF = "Checking automatically.";
 let remedies = {}; // command lines of this server, by what is missing
+let tritonUrl = "";
 
-/** From now on, states name the command lines of this server. */
-export function useRemedies(told) {
-  remedies = told;
+/** From now on, states name the command lines of this server, and Triton's address. */
+export function useRemedies(told, url) {
+  [remedies, tritonUrl] = [told, url];
 }
 
 /** The server that brought the page is away. */
 export function serverAway(error, retry) {
   return {
     title: "The server does not answer",
-    text: "It has stopped, or the network is down. If it does not come back, restart it with your options, for example:",
+    text: "It has stopped, or the network is down. If it does not come back, restart it as before:",
     command: remedies.start,
     details: error.message,
     buttons: [["Check now", retry]],
@@ -71,12 +73,14 @@ export function noEpisode(retry) {
   };
 }
 
-export function noLabels(dataset) {
+/** dataset: name and kind; needsTask: an episode has none */
+export function noLabels(dataset, needsTask) {
+  const words = ["rfm-client", "label", ...datasetWords(dataset), ...serverOption(tritonUrl)].map(quoted);
   return {
     kind: "empty",
     title: "No labels",
-    text: "Label this dataset, then reload the page:",
-    command: `rfm-client label ${quoted(dataset)}`,
+    text: `Label this dataset${needsTask ? ", with what the robot does as the SENTENCE" : ""}, then reload the page:`,
+    command: [...words, ...(needsTask ? ['--task "SENTENCE"'] : [])].join(" "),
   };
 }
 

@@ -2,7 +2,7 @@
 // The legend of the questions: the captions of the videos name the colours, and this names the lines.
 
 import { colourOf } from "./chart.js";
-import { questionsOf } from "./curves.js";
+import { failedOf, questionsOf } from "./curves.js";
 import { byQuestion } from "./looks.js";
 import { nameable, remover } from "./nameable.js";
 import { sampleOf } from "./svg.js";
@@ -35,15 +35,17 @@ export class Legend {
     questions.forEach((question, place) => {
       if (!this.#items.has(question.key)) this.#items.set(question.key, this.#newItem());
       const item = this.#items.get(question.key);
-      const { element, colour, line, name, away } = item;
+      const { element, colour, line, name, trouble, away } = item;
       const [first] = question.curves;
       item.curves = question.curves;
       if (this.#host.children[place] !== element) this.#host.insertBefore(element, this.#host.children[place] ?? null);
-      colour.hidden = !isByQuestion;
       colour.value = colourOf(first);
       colour.setAttribute("aria-label", `Colour of ${question.name}`);
       line.style.color = isByQuestion ? colourOf(first) : "";
       line.replaceChildren(sampleOf(first.dash));
+      trouble.textContent = failedOf(question.curves);
+      line.hidden = trouble.textContent === "failed"; // no line is drawn
+      colour.hidden = line.hidden || !isByQuestion;
       name.show(question.name, `${first.task} (${first.model}, ${first.sampling})`, NAME_LETTERS);
       away.setAttribute("aria-label", `Remove the curves of ${question.name}`);
     });
@@ -51,14 +53,15 @@ export class Legend {
   }
 
   #newItem() {
-    const [element, colour, line] = ["li", "input", "span"].map((tag) => document.createElement(tag));
-    const item = { element, colour, line, curves: [] };
+    const [element, colour, line, trouble] = ["li", "input", "span", "span"].map((tag) => document.createElement(tag));
+    const item = { element, colour, line, trouble, curves: [] };
+    trouble.className = "failed";
     colour.type = "color";
     colour.className = "swatch";
     colour.addEventListener("input", () => this.#changeAll(item, { questionColour: colour.value }));
     item.name = nameable((text) => this.#changeAll(item, { title: text || null }));
     item.away = remover(() => this.#onRemove(item.curves));
-    element.append(colour, line, item.name.element, item.away);
+    element.append(colour, line, item.name.element, trouble, item.away);
     return item;
   }
 

@@ -12,10 +12,11 @@ export const DASHES = [null, [8, 4], [2, 3], [12, 3, 2, 3], [5, 2], [16, 4]];
 export function giveLooks(curves) {
   const questions = questionsOf(curves);
   const isByQuestion = byQuestion(curves, questions);
-  questions.forEach(({ curves: alike, title, colour }, place) => {
+  questions.forEach(({ curves: alike, name, title, colour }, place) => {
     for (const curve of alike) {
       const look = isByQuestion ? { index: place, colour } : { index: curve.video.place, colour: curve.video.colour };
-      Object.assign(curve, { ...look, title, questionColour: colour, dash: DASHES[place % DASHES.length] });
+      const asked = questions.length > 1 && name !== curve.task ? name : null; // a column has the task
+      Object.assign(curve, { ...look, asked, title, questionColour: colour, dash: DASHES[place % DASHES.length] });
     }
   });
 }

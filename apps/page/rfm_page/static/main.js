@@ -4,7 +4,7 @@
 import { aboutServer, compare, GatewayAway, hasKey, KeyWanted, score, served, ServerError, useKey } from "./api.js";
 import { Address } from "./address.js";
 import { Asking } from "./asking.js";
-import { Curve } from "./curves.js";
+import { Curve, failedOf } from "./curves.js";
 import { DatasetTab } from "./dataset.js";
 import { exampleFiles } from "./examples.js";
 import { failure, noModel, otherModel, serverAway, tritonAway, useRemedies } from "./faults.js";
@@ -21,6 +21,7 @@ import { Tabs } from "./tabs.js";
 import { Timeline } from "./timeline.js";
 import { commands, csv, json, save } from "./takeaway.js";
 import { learn, toldAt } from "./signals.js";
+import { writeCommand } from "./text.js";
 import { addVerdict, ofOneFile, sentenceOf } from "./verdicts.js";
 
 const CURVES_AT_A_TIME = 3;
@@ -69,7 +70,7 @@ async function askServer(isCurrent) {
   learn(about.scores); // before a tab draws a curve
   if (!isCurrent()) return true;
   if (!gateway.rules.length) offer(about);
-  useRemedies(about.remedies);
+  useRemedies(about.remedies, about.url);
   places.away.clear();
   page["key-form"].hidden = true;
   datasetTab.begin();
@@ -131,7 +132,10 @@ function showAnywhere(error) {
 
 /** Shows what is wrong on every tab, and begins again when the server is back. Says whether something of that kind is wrong. */
 function failedAnywhere(error) {
-  if (error instanceof GatewayAway) askingServer.begin();
+  if (error instanceof GatewayAway) {
+    places.away.clear(); // somebody asked: say it again, though it was closed
+    askingServer.begin();
+  }
   return showAnywhere(error);
 }
 
@@ -145,8 +149,8 @@ function chooseRule() {
   const model = gateway.models.find(({ name }) => name === page.model.value);
   if (model) page.rule.value = model.rule;
   page["one-view"].hidden = !model?.reads_views;
-  page.warning.textContent = model?.warning ? `${model.warning}; ${model.remedy}` : "";
-  page.warning.hidden = !model?.warning;
+  const [, command = "", about = ""] = model?.remedy?.match(/^(rfm \S+ \S+)(.*)/) ?? [];
+  page.warning.replaceChildren(...(model?.warning ? [`${model.warning}; `, Object.assign(document.createElement("code"), { textContent: command }), about] : []));
   page.threshold.parentElement.hidden = model?.has_success === false;
   showLimits();
 }
@@ -206,7 +210,8 @@ function showWhetherReady() {
   const isTaskThere = tasks().length > 0;
   if (isTaskThere || !videos.all.length) page["task-wanted"].textContent = "";
   page.score.disabled = !videos.all.length || !isTaskThere || !page.model.value;
-  page.score.title = page.score.disabled ? "Needs a task, a video, and a model that is served" : "";
+  const missing = [!videos.all.length && "a video", !isTaskThere && "a task"].filter(Boolean).join(" and ");
+  page.score.title = !page.score.disabled ? "" : missing ? `Add ${missing}` : "No model is served";
 }
 
 function form(fields, files) {
@@ -301,7 +306,10 @@ async function ask(curve, signal) {
     curve.state = "failed";
     curve.error = signal.aborted ? "stopped" : error.message;
     showEnds();
-    if (!signal.aborted) failed(error, `${video.name} could not be scored`, error instanceof ServerError ? scoreAll : null);
+    const faults = new Map(curves.filter((each) => each.error && each.error !== "stopped").map((each) => [each.name, each.error]));
+    if (faults.size > 1) error.message = [...faults].map(([name, fault]) => `${name}: ${fault}`).join("; ");
+    const title = faults.size > 1 ? `${faults.size} videos` : video.name;
+    if (!signal.aborted) failed(error, `${title} could not be scored`, error instanceof ServerError ? scoreAll : null);
   }
   setTimeout(update); // when the queue knows, too
 }
@@ -352,7 +360,9 @@ async function compareAll() {
   }
   comparing = null;
   update();
-  if (!signal.aborted) page.status.textContent = verdicts.slice(before).map(sentenceOf).join(" ");
+  if (signal.aborted) return;
+  page.status.textContent = "";
+  page["verdict-told"].textContent = verdicts.slice(before).map(sentenceOf).join(" ");
 }
 
 /** Shows a verdict, and scrolls to it. */
@@ -499,8 +509,8 @@ function update() {
   const isByQuestion = byQuestion(curves);
   for (const video of videos.all) {
     const own = curves.filter((curve) => curve.video === video);
-    videos.mark(video, isByQuestion ? null : own[0]);
-    videos.tell(video, own.map(({ state }) => state));
+    videos.mark(video, isByQuestion || failedOf(own) === "failed" ? null : own[0]);
+    videos.tell(video, own);
   }
   showTable(page.curves, curves, Number(page.threshold.value));
   page.stop.disabled = queue.isIdle && !comparing;
@@ -510,7 +520,7 @@ function update() {
   page.take.hidden = !scored.length && !answered().length;
   page.verdicts.hidden = !verdicts.length;
   page.png.disabled = page.svg.disabled = page.csv.disabled = !scored.length;
-  page.command.textContent = commands(gateway.url, scored, answered());
+  writeCommand(page.command, commands(gateway.url, scored, answered()));
   told();
   showWhetherReady();
   page.scored.textContent = curves.length ? howMany() : "";

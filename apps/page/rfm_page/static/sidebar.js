@@ -16,9 +16,9 @@ export class Sidebar {
     button.addEventListener("click", () => this.#set(!this.#isOpen));
   }
 
-  /** Shows the settings. */
+  /** Shows the field for tasks, which a narrow window always shows. */
   open() {
-    if (!this.#isOpen) this.#set(true);
+    if (!this.#isOpen && this.#isWide) this.#set(true);
   }
 
   /** Folds the settings away where they would hide what is shown. */

@@ -1,6 +1,9 @@
 // SPDX-License-Identifier: MIT
 // Empty and failed states: a title, a sentence, a command to copy, what was said word for word, and what one can do.
 
+import { remover } from "./nameable.js";
+import { writeCommand } from "./text.js";
+
 const COPIED_FOR_MS = 2000;
 
 /** A place of the page where a state may stand. */
@@ -24,10 +27,12 @@ export class Place {
     const told = JSON.stringify([kind, title, text, command, details, note]);
     if (this.#host.dataset.told === told) return; // somebody may be reading it, or have opened the details
     const parts = [made("h2", title)];
-    if (text) parts.push(made("p", text));
-    if (command) parts.push(commandLine(command));
+    const remedy = [text && made("p", text), command && commandLine(command)].filter(Boolean);
+    const isBar = this.#host.classList.contains("bar");
+    if (!isBar) parts.push(...remedy);
     if (buttons.length || note) parts.push(actions(buttons, note));
-    if (details) parts.push(detailsOf(details));
+    if (details) parts.push(detailsOf(details, isBar ? remedy : []));
+    if (isBar) parts.push(Object.assign(remover(() => this.#host.replaceChildren()), { ariaLabel: "Close" })); // what was told stays told
     const state = document.createElement("div");
     state.className = `state ${kind}`;
     state.append(...parts);
@@ -55,7 +60,7 @@ export async function copied(text, element) {
 function commandLine(command) {
   const [line, text, button] = ["div", "pre", "button"].map((name) => document.createElement(name));
   line.className = "command";
-  text.textContent = command;
+  writeCommand(text, command);
   text.tabIndex = 0;
   text.setAttribute("role", "region");
   text.setAttribute("aria-label", `Command line: ${command}`); // two regions need two names
@@ -82,9 +87,9 @@ function actions(buttons, note) {
   return line;
 }
 
-function detailsOf(text) {
+function detailsOf(text, before) {
   const details = document.createElement("details");
-  details.append(made("summary", "Details"), made("p", text));
+  details.append(made("summary", "Details"), ...before, Object.assign(made("p", text), { className: "about" }));
   return details;
 }
 

@@ -12,6 +12,9 @@ export function showTable(body, curves, threshold) {
   const table = body.closest("table");
   const leading = columnOf(curves.map(leadingOf));
   table.querySelector(".leading").textContent = `Final ${leading.title}`;
+  const tasks = new Set(curves.map(({ task }) => task));
+  table.caption.textContent = tasks.size === 1 ? `Task: ${[...tasks][0]}` : "";
+  table.classList.toggle("one-task", tasks.size === 1);
   table.classList.toggle("unjudged", curves.some(({ state }) => state === "done") && curves.every(({ success }) => success.every((value) => value === null)));
   const names = [...table.querySelectorAll("thead th")].map((head) => head.textContent);
   body.replaceChildren(...curves.map((curve) => label(row(curve, threshold, leading.text), names)));
@@ -30,9 +33,10 @@ function row(curve, threshold, leadingText) {
   element.append(named(curve, curve.name), ...[curve.task, curve.model, curve.sampling].map((text) => cell(text)), cell(frames, "number"));
   const leading = leadingOf(curve);
   element.append(...[leadingText(leading, curve[leading].at(-1)), shown(curve.success.at(-1))].map((text) => cell(text, "number")));
-  element.append(cell(from === null ? NONE : `${from.toFixed(2)} s`, "number"));
+  const isLost = from !== null && curve.state === "done" && curve.success.findLast((value) => value !== null) < threshold;
+  element.append(cell(from === null ? NONE : `${from.toFixed(2)} s${isLost ? ", then lost" : ""}`, "number"));
   const warning = curve.blank && `${curve.blank}: the scores mean nothing`;
-  element.append(cell(curve.error ?? [curve.state, warning].filter(Boolean).join("; "), curve.error || warning ? "failed" : ""));
+  element.append(cell(curve.error ?? [curve.state === "done" ? "scored" : curve.state, warning].filter(Boolean).join("; "), curve.error || warning ? "failed" : ""));
   return element;
 }
 
@@ -44,7 +48,7 @@ function named(curve, name) {
   swatch.className = "swatch";
   swatch.style.background = curve.colour ?? `var(--${colourName(curve.index)})`; // of either theme
   header.title = name;
-  header.append(swatch, cut(name, NAME_LETTERS));
+  header.append(swatch, [cut(name, NAME_LETTERS), curve.asked && cut(curve.asked, NAME_LETTERS)].filter(Boolean).join(", "));
   return header;
 }
 

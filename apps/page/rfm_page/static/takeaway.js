@@ -109,17 +109,26 @@ function labelLine(group, url) {
   const corrections = group.flatMap(({ video, orient, channels }) => corrected({ orient, channels }, `${video.origin.camera}=`));
   const options = ["--episodes", origin.episode, "--cameras", cameras.join(","), ...corrections, ...sampling(rule, sampledFrames)];
   const given = task === origin.task ? [] : ["--task", task, "--override-task"];
-  const words = ["rfm-client", "label", origin.dataset, ...serverOption(url), "--model", model, ...given, ...options];
+  const words = ["rfm-client", "label", ...datasetWords({ name: origin.dataset, kind: origin.kind }), ...serverOption(url), "--model", model, ...given, ...options];
   const target = ["--output", `${origin.dataset.replace("/", "_")}_episode_${origin.episode}`, "--format", "progress"];
   return [...words, ...(resize ? ["--resize"] : []), ...target].map(quoted).join(" ");
+}
+
+/** The words that name a dataset, in the folder that holds it: of some, also how its files are read. */
+export function datasetWords({ name, kind }) {
+  const [how, what] = kind.split(/ (.*)/s);
+  const option = { pattern: "--videos", reader: "--reader" }[how];
+  return option ? [name, option, what] : [name];
 }
 
 function line(command, videos, { task, model, fps, orient, channels, resize }, url, options) {
   const cut = videos.find(({ origin }) => origin?.dataset);
   if (cut) return commented(`${command}: no file holds episode ${cut.origin.episode} of ${cut.origin.dataset} alone`);
-  const files = videos.map(({ name, origin }) => origin?.url ?? (name.startsWith("-") ? `./${name}` : name));
+  const urls = videos.flatMap(({ origin }) => (origin?.url ? ["-O", origin.url] : []));
+  const fetched = urls.length ? `${["curl", "-f", ...urls].map(quoted).join(" ")} && ` : "";
+  const files = videos.map(({ name }) => (name.startsWith("-") ? `./${name}` : name));
   const words = ["rfm-client", command, ...files, ...serverOption(url), "--model", model, "--task", task, "--fps", fps];
-  return [...words, ...corrected({ orient, channels }), ...(resize ? ["--resize"] : []), ...options].map(quoted).join(" ");
+  return fetched + [...words, ...corrected({ orient, channels }), ...(resize ? ["--resize"] : []), ...options].map(quoted).join(" ");
 }
 
 /** The options that make frames upright RGB. camera: "" or the camera that is meant, with = behind it */

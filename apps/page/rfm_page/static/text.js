@@ -44,6 +44,12 @@ function reversed(text) {
   return [...text].reverse().join("");
 }
 
+/** Writes a command line into an element, which breaks its lines between words: a browser would break them behind hyphens. */
+export function writeCommand(element, command) {
+  const pieces = command.split(/(\s+)/);
+  element.replaceChildren(...pieces.map((piece, place) => (place % 2 ? piece : Object.assign(document.createElement("span"), { textContent: piece }))));
+}
+
 /** Writes a name into an element, which breaks lines between the words of the name. */
 export function writeName(element, name) {
   const pieces = name.split(/(?<=[_\-/…])|(?=\.)/);

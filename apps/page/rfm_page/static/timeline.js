@@ -62,7 +62,10 @@ export class Timeline {
     this.#button.textContent = this.videos.isPlaying ? "Pause" : "Play";
     this.#button.classList.toggle("pauses", this.videos.isPlaying);
     this.#slider.value = this.time;
-    this.#told.textContent = this.#slider.disabled ? "" : `${this.time.toFixed(2)} / ${Number(this.#slider.max).toFixed(2)} s`;
+    const { allTimes = [] } = this.#curves[0] ?? {};
+    const isOneRate = this.#curves.every((curve) => curve.allTimes.length === allTimes.length); // else frames have several numbers
+    const frame = isOneRate ? `frame ${(pointAt(allTimes, this.time) ?? 0) + 1} of ${allTimes.length}, ` : "";
+    this.#told.textContent = this.#slider.disabled ? "" : `${frame}${this.time.toFixed(2)} / ${Number(this.#slider.max).toFixed(2)} s`;
     this.#slider.setAttribute("aria-valuetext", [`${this.time.toFixed(2)} seconds`, ...this.#numbers()].join("; "));
     const points = this.#points;
     const at = points[pointAt(points, this.time)] ?? this.time; // between two points there is no number

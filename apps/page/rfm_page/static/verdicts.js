@@ -4,6 +4,7 @@
 import { colourName } from "./chart.js";
 import { shown } from "./text.js";
 
+const AND = new Intl.ListFormat("en-GB");
 const CHUNK_BYTES = 4 * 2 ** 20;
 
 /** What the model says of videos, in one sentence. verdict: videos, task, model, and the gateway's answer; null: two are one file */
@@ -15,8 +16,8 @@ export function sentenceOf({ videos, answer }) {
   if (isAnswered && best < 0) return "No best video: several win equally often.";
   if (isAnswered) return `${videos[best].title} does the task ${videos.length > 2 ? "best" : "better"}.`;
   const [{ orders_agree: agree }, ...others] = answer.pairs;
-  const unranked = videos.filter((_, index) => answer.videos[index].rank === null).map(({ title }) => title).join(", ");
-  if (others.length) return `${best < 0 ? "No best video" : `${videos[best].title} does the task best, but ${unranked} have no rank`}: some answers depend on which video comes first.`;
+  const unranked = videos.filter((_, index) => answer.videos[index].rank === null).map(({ title }) => title);
+  if (others.length) return `${best < 0 ? "No best video" : `${videos[best].title} does the task best, but ${AND.format(unranked)} have no rank`}: some answers depend on which video comes first.`;
   return agree ? "No verdict: both answers are exactly 0.5." : "No verdict: the answer depends on which video comes first.";
 }
 
@@ -44,7 +45,7 @@ function rankingOf(videos, answer) {
     share.style.width = `${100 * wins}%`;
     share.style.background = video.colour ?? `var(--${colourName(video.place)})`;
     bar.append(share);
-    item.append(element("span", rank ? `${rank} ${video.title}` : `${video.title} (no rank)`), bar, element("span", `wins ${shown(wins)}`));
+    item.append(element("span", rank ? `${rank} ${video.title}` : `${video.title} (no rank)`), bar, element("span", `mean preference ${shown(wins)}`));
     list.append(item);
   }
   return list;

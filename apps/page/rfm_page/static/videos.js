@@ -2,6 +2,7 @@
 // The videos of the page, which move together: one time for all of them.
 
 import { colourName, colourOf } from "./chart.js";
+import { failedOf } from "./curves.js";
 import { nameable, remover } from "./nameable.js";
 
 const AS_STORED = { orient: "none", channels: "rgb" };
@@ -58,6 +59,7 @@ export class Videos {
     player.addEventListener("error", () => { trouble.hidden = false; });
     entry.swatch = document.createElement(this.#changing ? "input" : "span");
     Object.assign(entry.swatch, { className: "swatch", hidden: true });
+    entry.failed = Object.assign(document.createElement("span"), { className: "failed" });
     caption.append(entry.swatch, ...(this.#changing ? this.#controls(entry) : [name]));
     player.addEventListener("play", () => this.#follow(entry));
     player.addEventListener("seeked", () => this.#arrived(entry));
@@ -107,9 +109,10 @@ export class Videos {
     else entry.swatch.style.background = `var(--${colourName(curve.index)})`;
   }
 
-  /** Says of a video that this browser cannot show whether it was scored. states: of its curves */
-  tell(entry, states) {
-    const state = ["done", "failed"].find((each) => states.includes(each)) ?? "waiting";
+  /** Says whether all its curves failed, and of a video that this browser cannot show whether it was scored. */
+  tell(entry, curves) {
+    const state = ["done", "failed"].find((each) => curves.some((curve) => curve.state === each)) ?? "waiting";
+    entry.failed.textContent = failedOf(curves) === "failed" ? "failed" : ""; // of some, the legend says it
     entry.trouble.textContent = UNSHOWN[state];
   }
 
@@ -167,7 +170,7 @@ export class Videos {
       swatch.setAttribute("aria-label", `Colour of ${entry.title}`);
     };
     write();
-    return [title.element, away];
+    return [title.element, entry.failed, away];
   }
 
   #move(entry, seconds) {
