@@ -159,7 +159,7 @@ class SharedMemory:
         region = Region(next(self._names), byte_size)
         try:
             async with self._reserving:
-                await off_loop(byte_size, region.reserve)
+                await off_loop(None, region.reserve)  # may wait for memory
         except BaseException:  # also if cancelled: without the name the thread's work comes to nothing
             region.unlink()
             raise
