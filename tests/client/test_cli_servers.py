@@ -369,7 +369,7 @@ def test_a_server_that_goes_away_is_not_asked_any_more(engines: EngineServer, tm
         proxies.enter_context(engines.client("rfm")).model_info()  # loaded before the timeout counts
         proxy = proxies.enter_context(Proxy(int(engines.url.rpartition(":")[2])))
         url = f"grpc://127.0.0.1:{proxy.port}"
-        words = ("score", *[source] * NUM_SOURCES, "--timeout", 1, "--json", target, "--url", url)
+        words = ("score", *[source] * NUM_SOURCES, "--timeout", 2, "--json", target, "--url", url)
         with shown.open("w") as out, told.open("w") as err:
             process = subprocess.Popen([str(RFM_CLIENT), *map(str, words)], stdout=out, stderr=err)
             wait_for(lambda: len(rows(shown.read_text(), str(source))) >= 5)  # they come while others are asked

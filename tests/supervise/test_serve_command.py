@@ -127,7 +127,8 @@ def test_a_terminal_shows_one_screen_and_a_file_the_lines_of_triton(
         f"  log      {log} (lines of Triton and the models)",
     ):
         assert line in shown
-    assert shown[-4].endswith(f"rfm-client score VIDEO --task TASK --url {endpoints.grpc_url}")
+    assert any(line.endswith(f"rfm-client score VIDEO --task TASK --url {endpoints.grpc_url}") for line in shown)
+    assert "stopping, after the requests in flight" in shown[-1]
     assert "a stand-in has loaded rfm\n" in log.read_text()
 
 

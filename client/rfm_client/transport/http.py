@@ -19,7 +19,7 @@ from rfm_client.contract.triton import over_http
 from rfm_client.contract.wire import Tensors
 from rfm_client.transport.connection import SECURE_SCHEMES, Credentials
 from rfm_client.transport.shared_memory import Region
-from rfm_client.transport.threads import MIN_BYTES, off_loop
+from rfm_client.transport.threads import off_loop
 
 _REDIRECTS = range(300, 400)
 _AS_IT_IS = {"Accept-Encoding": "identity"}  # otherwise aiohttp asks for gzip, which hardly shrinks floats
@@ -72,8 +72,8 @@ class HttpClient(InferenceServerClient):  # type: ignore[misc]  # untyped
         Raises InferenceFailedError for a redirect and for another server than Triton, InferenceServerException for an
         error other than unreadiness.
         """
-        # aiohttp sends a stream piece by piece. Large bytes would block the event loop, and aiohttp warns about them.
-        data = io.BytesIO(body) if len(body) >= MIN_BYTES else body or None
+        # aiohttp sends a stream piece by piece. Bytes block the event loop, and from a MiB on it warns about them.
+        data = io.BytesIO(body) if len(body) >= 2**20 else body or None
         every = {**self._own_headers, **self._fix_header(headers or {})}
         url = f"{self._url}/{path}"
         answer = await self._stub.request(method, url, data=data, headers=every, allow_redirects=False)
