@@ -111,6 +111,8 @@ class Rollout:
             old |= self._configs(models, {model: max(served[model]) for model in models if served[model]})
         except (OSError, ParseError) as error:
             raise RolloutError.at(f"{self.name} version {version}", "an exported version", error) from error
+        for model in models:
+            self._check_served(model, served[model])
         check_files(self.repository, new)
         try:
             self._switch(new, served, version)
@@ -130,6 +132,13 @@ class Rollout:
             self._serve(new[model], [version])
             self.server.wait_gone(model, kept=[version])
             probe(self.server, new[model], version)
+
+    def _check_served(self, model: str, versions: Sequence[int]) -> None:
+        """Raise RolloutError if the server serves other weights than the repository has in these versions."""
+        here = [description_in(config_of(self.repository, model, version)).weights_digest for version in versions]
+        if here and (served := description_in(self.server.config(model)).weights_digest) not in here:
+            where, remedy = self.repository / model, "name the server's own repository (--repository)"
+            raise RolloutError.at(where, f"the weights that the server serves, {served}", f"{here[-1]}: {remedy}")
 
     def _go_back(self, old: Configs, served: Mapping[str, Sequence[int]]) -> str:
         """Serve the old versions again. Return the outcome in words."""

@@ -114,6 +114,10 @@ class RepositoryApi:
         ready = (entry for entry in self.index() if entry.name == model and entry.is_ready)
         return [entry.version for entry in ready if entry.version is not None]
 
+    def config(self, model: str) -> Any:
+        """Return the configuration of a served model, a ``ModelConfig``."""
+        return self._request(self._client.get_model_config, model).config
+
     def load(self, model: str) -> None:
         """Load the versions in the model's configuration. If the load fails, the served versions stay."""
         self._request(self._client.load_model, model)

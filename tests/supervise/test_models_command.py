@@ -28,6 +28,7 @@ from rfm.serve.repository_api import RepositoryApi, RepositoryApiError
 from rfm_client import ModelNotFoundError, ProgressSample, RewardClient, ServerError
 from rfm_commands import rollout as rfm_rollout
 from rfm_commands.rollout import Rollout, RolloutError
+from rfm_export.layout import description_in
 from rfm_export.publish import read_config
 from rollout import NAME, WITH_ENCODERS, callers
 from servers import Serving, administered, wait_for
@@ -224,10 +225,14 @@ class GoingAway:
     served: dict[str, list[int]]
     loads: int
     misses: int
+    repository: Path
     loaded: list[str] = field(default_factory=list)
 
     def ready_versions(self, model: str) -> list[int]:
         return self.served[model]
+
+    def config(self, model: str) -> ModelConfig:
+        return read_config(self.repository, model)
 
     def load(self, model: str) -> None:
         if len(self.loaded) >= self.loads and self.misses:
@@ -258,11 +263,24 @@ def test_each_model_is_probed_once_more_when_its_old_version_is_gone(
         def wait_gone(self, model: str, kept: list[int]) -> None:
             self.loaded.append("the old version is gone")
 
-    server = Unloading({part: [1] for part in PARTS}, 10**9, 0)
+    server = Unloading({part: [1] for part in PARTS}, 10**9, 0, three_models)
     monkeypatch.setattr(rfm_rollout, "probe", lambda *_: server.loaded.append("probe"))
     Rollout(shutil.copytree(three_models, tmp_path / "copy"), NAME, server, lambda line: None).to(2)  # type: ignore[arg-type]
     asked = zip(server.loaded, [*server.loaded[1:], ""], strict=True)
     assert [after for before, after in asked if before == "the old version is gone"] == ["probe"] * 3
+
+
+def test_another_repository_than_the_servers_is_refused(three_models: Path, tmp_path: Path) -> None:
+    own = shutil.copytree(three_models, tmp_path / "own")
+    config = own / "rfm_encoder" / "config.pbtxt"
+    digest = description_in(read_config(own, "rfm_encoder")).weights_digest
+    config.write_text(config.read_text().replace(str(digest), "0" * 16))
+    server = GoingAway({part: [1] for part in PARTS}, 0, 0, own)
+    with pytest.raises(
+        RolloutError, match=rf"{three_models}/rfm_encoder: expected the weights .* 0{{16}}, got {digest}"
+    ):
+        Rollout(three_models, NAME, server, lambda line: None).to(2)  # type: ignore[arg-type]
+    assert server.loaded == []
 
 
 @pytest.mark.parametrize("loads", [0, 2, 4])
@@ -274,7 +292,7 @@ def test_a_server_lost_during_a_rollout_leaves_the_earlier_versions_for_a_restar
     monkeypatch.setattr(rfm_rollout, "probe", lambda *_: None)
     monkeypatch.setattr(rfm_rollout, "RETURN_S", 60.0 if returns else 0.0)
     monkeypatch.setattr(rfm_rollout, "POLL_S", 0.0)
-    server = GoingAway({"rfm_encoder": [1], "rfm": [1], "rfm_frames": []}, loads, 9 if returns else 10**9)
+    server = GoingAway({"rfm_encoder": [1], "rfm": [1], "rfm_frames": []}, loads, 9 if returns else 10**9, three_models)
     ensemble = (three_models / "rfm_frames" / "config.pbtxt").read_bytes()
     with pytest.raises(RolloutError) as caught:
         Rollout(three_models, NAME, server, lambda line: None).to(2)  # type: ignore[arg-type]
