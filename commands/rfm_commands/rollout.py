@@ -109,10 +109,10 @@ class Rollout:
             # A model that is not served keeps its configuration in the repository.
             old = {model: read_config(self.repository, model) for model in models if not served[model]}
             old |= self._configs(models, {model: max(served[model]) for model in models if served[model]})
+            for model in models:
+                self._check_served(model, served[model])
         except (OSError, ParseError) as error:
             raise RolloutError.at(f"{self.name} version {version}", "an exported version", error) from error
-        for model in models:
-            self._check_served(model, served[model])
         check_files(self.repository, new)
         try:
             self._switch(new, served, version)

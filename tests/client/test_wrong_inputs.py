@@ -224,7 +224,5 @@ def test_unusable_inputs_are_refused_while_a_server_is_ready(
     code, *message = told
     expected = f"rfm-client: {''.join(map(str, message))}"
     exit_code, said = answer(f"rfm-client {words} --url {engines.url}")
-    assert (exit_code, re.sub("served: [^:]*rfm:", "served: rfm:", said)) == (
-        code,
-        expected,
-    )  # others serve more models
+    said = re.sub("served: [^:]*rfm:", "served: rfm:", said)  # without models that other tests have loaded
+    assert (exit_code, said) == (code, expected)

@@ -40,7 +40,7 @@ _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
 _SAMPLE_FIELD = re.compile(r"sample_(0|[1-9][0-9]{0,5})")
 _CHARSETS = ("utf-8", "utf8", "us-ascii")
 _FLAGS = {"true": True, "1": True, "false": False, "0": False, "": False}
-_JSON_COST = 256  # parsing a byte takes as long as copying so many
+_JSON_COST = 256  # bytes copied in the time that it takes to parse one
 _FORM_FLAGS = {**_FLAGS, "1": False}  # as the evaluation server reads forms
 
 Take: TypeAlias = Callable[[int], object]  # takes bytes from a budget, or raises

@@ -76,7 +76,7 @@ class RewardedEnvs:
         return np.array([episode.succeeded for _, episode in sorted(self.episodes.items())], np.bool_)
 
     def check_reset(self, mask: Mask) -> None:
-        """Warn once if a reset, unless after an error, drops unended episodes' reward. Call this before the reset.
+        """Warn once if a reset drops the reward of unended episodes, except after an error. Call this before the reset.
 
         Raises ValueError in mode ``final`` for the second such reset in a row: episodes that end outside the wrapper
         would never be paid. An end or an error between the resets allows the second.

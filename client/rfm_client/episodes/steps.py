@@ -73,7 +73,7 @@ class Steps:
         self._where = where
         self._corrections = options.corrections
         self.frames: list[tuple[Frame, ...]] = []  # by step and camera
-        self._num_changes: int | None = None  # of the checkpoint, until the first score
+        self._num_changes: int | None = None  # changes of the checkpoint before the first score
 
     @property
     def newest(self) -> int:
@@ -144,7 +144,7 @@ class Steps:
     def check_checkpoint(self, changes: Sequence[str]) -> None:
         """Raise InferenceFailedError if the checkpoint has changed since the episode's first score.
 
-        changes: all that the client has seen
+        changes: a line for each change that the client has seen
         """
         if self._num_changes is None:
             self._num_changes = len(changes)

@@ -115,7 +115,7 @@ class SampleScorer:
         self._infos: dict[str, ModelInfo] = {}  # until another model version answers, or a lost server
         self._returns = 0  # of servers, when the descriptions were last compared
         self._comparing = asyncio.Lock()
-        self.changes: list[str] = []  # of the checkpoint, if there is one server alone: which instead of which
+        self.changes: list[str] = []  # what each change of the checkpoint was; empty with several servers
         self._undescribed: set[str] = set()  # not asked about embeddings again, which they score without a description
         self._checks_lengths = True  # until a trajectory was too long
         self._checks_blank = True  # until a video was blank
@@ -287,7 +287,7 @@ class SampleScorer:
             error.request_id = request_id
             raise
         if self._may_differ(model, answer) or self._comparing.locked():
-            async with self._comparing:  # no answer of another checkpoint before its change is known
+            async with self._comparing:  # first tell of the change, then return the new checkpoint's answers
                 if self._may_differ(model, answer):
                     await self._compare(self._infos[model], model, call.deadline)
         return answer
@@ -301,14 +301,18 @@ class SampleScorer:
         return is_new or self._servers.returns != self._returns
 
     async def _compare(self, before: ModelInfo, model: str, deadline: Deadline) -> None:
-        """Describe the models anew, and log that another checkpoint answers, if it does."""
-        self._returns = self._servers.returns
-        self._infos.clear()
+        """Describe the model again, forget the others' descriptions, and log a change of the checkpoint.
+
+        If no server describes it, the next answer asks again.
+        """
+        returns = self._servers.returns
         try:
             infos = await self.model_infos(model, deadline)
         except RewardError as error:
+            self._infos[model] = before
             logger.warning("%s: cannot tell whether the checkpoint is the same as before: %s", model, error)
             return
+        self._returns, self._infos = returns, {model: infos[0]}
         now = next((info for info in infos if info.weights_digest != before.weights_digest), None)
         if now is not None:
             told = [f"{info.source or info.name} (weights {info.weights_digest})" for info in (now, before)]

@@ -59,7 +59,7 @@ class KnownServer:
     """One of several servers: transport, load and failures.
 
     failures: how often the server was left out since the last success
-    lost_at_s: when a request that is sent again first failed (monotonic clock); None: not since the last success
+    lost_at_s: when the first request that is retried failed (monotonic clock); None: none since the last success
     comeback: ends when the server reports ready again; None: never left out
     """
 

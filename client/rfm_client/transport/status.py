@@ -24,7 +24,7 @@ from rfm_client.transport.calls import TritonTransport
 from rfm_client.transport.connection import Credentials
 
 METRICS_PORT = 8002
-_PORTS = ("8000", "8001")  # Triton's own, beside METRICS_PORT; other ports may be those of a second server on the host
+_PORTS = ("8000", "8001")  # Triton's defaults beside METRICS_PORT; another port may belong to a second server
 METRICS_OPTION = "--metrics-url"
 _PROCESSOR = "CPU"
 _FRAMES = frames_name("")  # ends the names of models for raw frames

@@ -35,7 +35,7 @@ from rfm_labels.scorer import ClientScorer, Scorer
 from rfm_labels.summary import summarise
 from rfm_labels.writing import remove_files
 
-NOTE = "note: "  # a note of several files is said once
+NOTE = "note: "  # a note that several files share is printed once
 SPEED_OVER_S = 600.0  # an episode may take minutes
 Printer: TypeAlias = Callable[[str], None]
 _CAMERA_OPTIONS = ("orient", "channels")  # options with a value per camera
