@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -29,6 +31,11 @@ PIN = re.compile(r"^([\w.-]+)==([^\s;]+)", re.MULTILINE)
 NEED = re.compile(r"([\w.-]+)(?:.*extra == [\"'](\w+))?")
 DISTRIBUTIONS = {"rfm-client", "rfm-gateway", "rfm-page", "rfm-triton"}
 EXTRAS = {"", "encoders", "vlm", "quantized"}
+
+
+def words_of(command: str | list[str]) -> list[str]:
+    """Return a command as Compose splits it, without the variables that are unset."""
+    return shlex.split(re.sub(r"\$\{\w+:-\}", "", command)) if isinstance(command, str) else command
 
 
 def pins(file: Path) -> set[tuple[str, str]]:
@@ -61,7 +68,7 @@ def test_the_lock_has_all_needed_packages_in_the_versions_of_the_constraints_wit
 
 @pytest.mark.parametrize("name", OURS)
 def test_the_compose_file_s_commands_are_those_of_the_program(name: str) -> None:
-    program, command, *words = [*SERVICES[name].get("entrypoint", ENTRYPOINT), *SERVICES[name]["command"]]
+    program, command, *words = [*SERVICES[name].get("entrypoint", ENTRYPOINT), *words_of(SERVICES[name]["command"])]
     assert program in ("rfm", "rfm-client")  # whose gateway is the same
     assert rfm_parsed(command, *words)["host"] == "0.0.0.0"
 
@@ -71,7 +78,9 @@ def test_docker_compose_runs_the_services_that_prometheus_scrapes(
     docker_compose: str, profile: str, server: str
 ) -> None:
     words = [docker_compose, "--file", str(DOCKER / "compose.yaml"), "--profile", profile, "config"]
-    done = subprocess.run(words, capture_output=True, text=True)
+    done = subprocess.run(
+        words, env={**os.environ, "RFM_GATEWAY_OPTIONS": "--refuse-blank --timeout 600"}, capture_output=True, text=True
+    )
     assert (done.returncode, done.stderr) == (0, "")
     asked_for = yaml.safe_load(done.stdout)["services"].items()  # docker-compose 1 has those of other profiles, too
     services = {name: service for name, service in asked_for if profile in service.get("profiles", [profile])}
@@ -80,6 +89,8 @@ def test_docker_compose_runs_the_services_that_prometheus_scrapes(
         assert set(service.get("depends_on", {})) <= set(services)
         names |= {*((service.get("networks") or {}).get("default") or {}).get("aliases", [])}
     assert {"server", "gateway", "prometheus", "grafana"} <= names
+    (gateway,) = (service for name, service in services.items() if name.startswith("gateway"))
+    assert words_of(gateway["command"])[-3:] == ["--refuse-blank", "--timeout", "600"]
     scraped = yaml.safe_load((DOCKER / "prometheus" / "prometheus.yml").read_text())["scrape_configs"]
     hosts = {
         target.partition(":")[0] for job in scraped for each in job["static_configs"] for target in each["targets"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import configparser
 import getpass
+import json
 import re
 import shlex
 import shutil
@@ -12,6 +13,7 @@ import ssl
 import subprocess
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from http.client import HTTPSConnection
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
@@ -154,7 +156,9 @@ def test_nginx_passes_on_the_requests_that_scoring_needs_with_a_key_and_nothing_
     assert not {key for key in (alice, bob) if key in log}
 
 
-def test_nginx_passes_bodies_sent_as_forms_to_triton_as_octet_streams(nginx: str, papers: Path) -> None:
+def test_nginx_passes_forms_to_triton_as_octet_streams_and_refuses_large_bodies_in_json(
+    nginx: str, papers: Path
+) -> None:
     """With a stand-in for Triton."""
 
     class Told(Quiet, BaseHTTPRequestHandler):
@@ -170,7 +174,13 @@ def test_nginx_passes_bodies_sent_as_forms_to_triton_as_octet_streams(nginx: str
     with web_server(Told) as url, proxy(nginx, papers, {"http": httpx.URL(url).port or 0, "proxy": port}):
         infer = f"https://{IP}:{port}/v2/models/rfm/infer"
         answer = httpx.post(infer, content=b"{}", headers=form, verify=context)
+        with closing(HTTPSConnection(IP, port, context=context)) as connection:
+            connection.request("POST", "/v2/models/rfm/infer", headers={**form, "Content-Length": str(2**30)})
+            refused = connection.getresponse()
+            told = json.loads(refused.read())
     assert (answer.status_code, answer.headers["X-Type"]) == (200, "application/octet-stream")
+    limit = "body: expected at most client_max_body_size of nginx, got more"
+    assert (refused.status, told) == (413, {"error": limit, "detail": limit})
 
 
 def test_nginx_does_not_start_with_an_empty_key(nginx: str, papers: Path) -> None:
