@@ -156,7 +156,7 @@ class TritonWatch:
         for model in sorted(before.keys() | ready.keys()):
             was, now = before.get(model, []), ready.get(model, [])
             if was != now and not (was and {*was} < {*now}):  # in a rollout, both for a moment
-                logger.info("%s: serves version %s, before %s", model, *(_listed(each) for each in (now, was)))
+                logger.info("%s: serves version %s (before: %s)", model, *(_listed(each) for each in (now, was)))
 
     def _forget(self, model: str) -> None:
         """Stop probing a model that was reloaded or unloaded."""

@@ -252,7 +252,7 @@ def test_a_restart_serves_the_same_models_and_versions_and_no_newer_export(
             assert "versions: 1" in stage.file(f"loaded-{model}").read_text()
         httpx.post(f"{stage.serving.endpoints.http_url}/v2/repository/models/a/load")
         assert stage.file("loaded-a").read_text() == config.read_text()  # a later load reads the repository's files
-    assert {"b: serves version none, before 1", "c: serves version 1, before none"} <= {*caplog.messages}
+    assert {"b: serves version none (before: 1)", "c: serves version 1 (before: none)"} <= {*caplog.messages}
 
 
 @pytest.mark.parametrize(
