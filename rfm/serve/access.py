@@ -6,6 +6,7 @@ from __future__ import annotations
 import random
 import re
 import secrets
+import shlex
 import socket
 import stat
 from collections import deque
@@ -97,8 +98,8 @@ def read_key(file: Path, option: str) -> str:
         expected = 0o640 if status.st_uid == 0 else 0o600
         mode = stat.S_IMODE(status.st_mode)
         if mode & ~expected:
-            owner = "root's file" if status.st_uid == 0 else "file"
-            raise InvalidValueError.at(f"{option}: {file}", f"mode {expected:o} or less of a {owner}", f"{mode:o}")
+            where, remedy = f"{option}: {file}", f"chmod 600 {shlex.quote(str(file))}"
+            raise InvalidValueError.at(where, f"mode {expected:o} or less", f"{mode:o}", remedy)
         return _checked(file.read_text(), f"{option}: {file}")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "no text"

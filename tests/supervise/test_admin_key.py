@@ -54,9 +54,9 @@ def test_the_server_changes_nothing_without_its_key(served: Served, tmp_path: Pa
     ("content", "user", "mode", "message"),
     [
         pytest.param(None, 0, 0, "expected a text file at FILE, got No such file or directory", id="missing"),
-        pytest.param("k" * 16, 0, 0o604, "FILE: expected mode 640 or less of a root's file, got 604", id="others"),
-        pytest.param("k" * 16, 0, 0o660, "FILE: expected mode 640 or less of a root's file, got 660", id="group"),
-        pytest.param("k" * 16, 7, 0o440, "FILE: expected mode 600 or less of a file, got 440", id="a user's group"),
+        pytest.param("k" * 16, 0, 0o604, "FILE: expected mode 640 or less, got 604; chmod 600 FILE", id="others"),
+        pytest.param("k" * 16, 0, 0o660, "FILE: expected mode 640 or less, got 660", id="group"),
+        pytest.param("k" * 16, 7, 0o440, "FILE: expected mode 600 or less, got 440", id="a user's group"),
         pytest.param("k" * 15, 0, 0o600, "FILE: expected at least 16 characters, got 15", id="short"),
         pytest.param("k" * 16 + "ü", 0, 0o600, "FILE: expected visible ASCII characters without", id="characters"),
         pytest.param("", 0, -1, "expected a file, got FILE, which is none", id="folder"),
