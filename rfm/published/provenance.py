@@ -50,7 +50,7 @@ def source_name(source: str | Path) -> str:
     folder = Path(source).expanduser().resolve()
     snapshot = snapshot_of(folder)
     if snapshot is None or not snapshot.parent.parent.name.startswith(HUB_FOLDER):
-        return "/".join(folder.parts[-_NAMED_PARTS:])
+        return "/".join(folder.parts[1:][-_NAMED_PARTS:])  # without the root
     names = [*snapshot.parent.parent.name.removeprefix(HUB_FOLDER).split("--"), *folder.relative_to(snapshot).parts]
     return f"{'/'.join(names)}@{snapshot.name}"
 

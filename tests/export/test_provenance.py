@@ -21,6 +21,7 @@ import rfm_export
 from engines import serve_config
 from rfm import published
 from rfm.files import CheckpointError
+from rfm.published import provenance
 
 PLAIN, VIDEO, POOLED, ADAPTER = (
     "q3_tok_disc10",
@@ -195,3 +196,8 @@ def test_an_adapter_of_a_run_that_began_with_a_checkpoint_needs_its_base_named(v
     with pytest.raises(CheckpointError, match=expected):
         notes(folder)
     assert notes(folder, base) == []
+
+
+@pytest.mark.parametrize(("folder", "name"), [("/usr/share/doc", "share/doc"), ("/usr", "usr")])
+def test_a_folder_has_the_name_of_its_last_two_parts(folder: str, name: str) -> None:
+    assert provenance.source_name(folder) == name
