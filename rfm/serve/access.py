@@ -98,7 +98,7 @@ def read_key(file: Path, option: str) -> str:
         expected = 0o640 if status.st_uid == 0 else 0o600
         mode = stat.S_IMODE(status.st_mode)
         if mode & ~expected:
-            where, remedy = f"{option}: {file}", f"chmod 600 {shlex.quote(str(file))}"
+            where, remedy = f"{option}: {file}", f"chmod {expected:o} {shlex.quote(str(file))}"
             raise InvalidValueError.at(where, f"mode {expected:o} or less", f"{mode:o}", remedy)
         return _checked(file.read_text(), f"{option}: {file}")
     except (OSError, UnicodeDecodeError) as error:

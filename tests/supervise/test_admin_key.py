@@ -54,7 +54,7 @@ def test_the_server_changes_nothing_without_its_key(served: Served, tmp_path: Pa
     ("content", "user", "mode", "message"),
     [
         pytest.param(None, 0, 0, "expected a text file at FILE, got No such file or directory", id="missing"),
-        pytest.param("k" * 16, 0, 0o604, "FILE: expected mode 640 or less, got 604; chmod 600 FILE", id="others"),
+        pytest.param("k" * 16, 0, 0o604, "FILE: expected mode 640 or less, got 604; chmod 640 FILE", id="others"),
         pytest.param("k" * 16, 0, 0o660, "FILE: expected mode 640 or less, got 660", id="group"),
         pytest.param("k" * 16, 7, 0o440, "FILE: expected mode 600 or less, got 440", id="a user's group"),
         pytest.param("k" * 15, 0, 0o600, "FILE: expected at least 16 characters, got 15", id="short"),
