@@ -29,7 +29,8 @@ THRESHOLD: dict[str, Any] = {
     "linestyle": ":",
     "linewidth": 0.9,
     "zorder": 1,
-}  # the line above which success counts
+    "label": f"success if last ≥ {SUCCESS_THRESHOLD}",
+}  # the line from which success counts, as in ``FrameScores.succeeded``
 GRID: dict[str, Any] = {"color": "#dde2e6", "linewidth": 0.5, "zorder": 0}
 BOUNDS = (-0.03, 1.03)  # limits for an axis from 0 to 1
 
@@ -72,8 +73,8 @@ def plot_scores(
 
     Models that predict another score instead of progress, such as remaining seconds, get an axis in that unit.
 
-    The figure is light whatever style is set. A dotted line marks success 0.5. ``save`` writes the
-    figure. ``matplotlib.style.use("rfm_client.figure")`` gives other figures the same style.
+    The figure is light whatever style is set. A dotted line marks the success that counts. ``save`` writes the figure.
+    ``matplotlib.style.use("rfm_client.figure")`` gives other figures the same style.
 
     names: curve names for the legend; long names lose their middle
     times_s: per result float64 [T], the times of the T scored frames; the axis counts frames if any are unknown
@@ -98,7 +99,7 @@ def plot_scores(
 
         colours = rcParams["axes.prop_cycle"].by_key()["color"]  # "C0" would follow a style set later
         columns = 2 if max(map(len, names)) <= _SHORT else 1
-        lines_in = _LINE_IN * (-(-len(results) // columns) + 3 + (title or "").count("\n"))
+        lines_in = _LINE_IN * (-(-(len(results) + has_success) // columns) + 3 + (title or "").count("\n"))
         needed_in = sum(heights_in) + lines_in
         canvas = Canvas(_WIDTH_IN, needed_in, SCREEN_DPI)
         if size != "paper":

@@ -123,8 +123,9 @@ def _existing(folder: Path) -> Path:
 
 
 def size(number: float) -> str:
-    """Return bytes as text in GB or MB."""
-    return f"{number / _GB:.1f} GB" if number >= _GB else f"{number / _MB:.1f} MB"
+    """Return bytes as text in GB or MB, with two digits."""
+    unit, name = (_GB, "GB") if number >= _GB else (_MB, "MB")
+    return f"{float(f'{number / unit:.2g}'):g} {name}"
 
 
 def _duration(seconds: float) -> str:

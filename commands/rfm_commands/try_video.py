@@ -61,15 +61,20 @@ def try_video(
             fail(f"{output}: expected a folder that can be made, got: {error.strerror}; --output names another one")
         served = repository if settings.checkpoint is None else _exported_frames(settings)
         with temporary_server(served, output / "tritonserver.log", tritonserver) as endpoints:
-            info = score_video(endpoints, video, frames, task, output / f"{video.stem}.scores.png")
+            info = score_video(endpoints, video, frames, task, output)
     source = [repository] if settings.checkpoint is None else [settings.checkpoint, *_words(given)]
     steps = steps_without_server(source, video, task)
     if info.warning:
         public = command("rfm", "try", video, "--task", task, "--checkpoint", PUBLIC_CHECKPOINT)
         steps.insert(0, ("score the video with a public checkpoint", public))
     else:
+        install = command("pip", "install", "-c", "constraints.txt", "./apps/labels")
         measure = command("rfm-client", "evaluate", "DATASET", "--outcome", "outcomes.csv")
-        steps.insert(0, (f"is it right on your robot? Label episodes and measure it: {HOW_GOOD}", measure))
+        steps += [
+            (f"is it right on your robot? measure it ({HOW_GOOD})", install),
+            ("label episodes, while the model is served", command("rfm-client", "label", "DATASET")),
+            ("compare labels with outcomes", measure),
+        ]
     typer.echo(next_steps(*steps))
 
 
@@ -83,13 +88,14 @@ def steps_without_server(source: Sequence[object], video: Path, task: str) -> li
     return [(f"serve the model, and the page at {PAGE_URL}", served), ("in another terminal, score the video", score)]
 
 
-def score_video(endpoints: Endpoints, video: Path, frames: UInt8Array, task: str, picture: Path) -> ModelInfo:
+def score_video(endpoints: Endpoints, video: Path, frames: UInt8Array, task: str, output: Path) -> ModelInfo:
     """Score the video, print the table, draw the plot, and describe the model.
 
     frames: uint8 [T, H, W, 3], T frames, H x W pixels, evenly thinned if the checkpoint takes fewer
+    output: folder for the plot, whose name holds those of video and checkpoint
     """
     from rfm_client.cli.pictures import Panel, plot
-    from rfm_client.cli.scoring import heading
+    from rfm_client.cli.scoring import checkpoint_name, heading
     from rfm_client.frames.video import frame_times_s
 
     with RewardClient(endpoints.grpc_url) as client:
@@ -97,11 +103,13 @@ def score_video(endpoints: Endpoints, video: Path, frames: UInt8Array, task: str
         result = client.progress(trajectory, subsample=True)
         info = client.model_info(frames=True)
     if len(result.progress) < len(frames):
-        typer.echo(f"{video.name}: {len(result.progress)} of {len(frames)} frames, evenly, are scored")
-    print(scores_table(f'"{task}"', [(video.name, result)]))
+        typer.echo(f"{video.name}: {len(result.progress)} of {len(frames)} frames are scored, evenly spaced")
+    name = checkpoint_name(info)
+    print(scores_table(f'"{task}", scored by {name}', [(video.name, result)]))
     if info.warning:
         typer.echo(f"note: {info.warning}")
     title = heading(task, [info])
+    picture = output / f"{video.stem}.{name.replace('/', '.')}.png"
     plot(picture, [Panel.of(video.name, result, frames, frame_times_s(video, len(frames)))], title)
     typer.echo(f"The curves are in {picture}.")
     return info

@@ -72,9 +72,10 @@ class ModelVersion:
         return self.state == _NOT_LOADED or (self.state, self.reason) == (_UNAVAILABLE, _UNLOADED)
 
 
-_KEYS = (  # what an administrator's and a caller's request show, in which header, and where it comes from
-    ("admin key", HEADER, f"--admin-key-file or {VARIABLE}"),
-    ("API key", triton.AUTHORIZATION, "--api-key-file or RFM_API_KEY_FILE"),
+_NO_KEY = "a server started without one takes none: start it again with --admin-key-file"
+_KEYS = (  # what an administrator's and a caller's request show, in which header, where it comes from, and a remedy
+    ("admin key", HEADER, f"--admin-key-file or {VARIABLE}", _NO_KEY),
+    ("API key", triton.AUTHORIZATION, "--api-key-file or RFM_API_KEY_FILE", ""),
 )
 
 
@@ -162,9 +163,11 @@ class RepositoryApi:
         except InferenceServerException as error:
             message = one_line(error.message() or "no reason given")
             if triton.RESTRICTED in message:
-                key, header, options = _KEYS[call in (self._client.infer, self._client.get_system_shared_memory_status)]
+                is_callers = call in (self._client.infer, self._client.get_system_shared_memory_status)
+                key, header, options, remedy = _KEYS[is_callers]
                 got = "another" if f"{triton.METADATA_PREFIX}{header}" in self._headers else "none"
-                raise RepositoryApiError.at(key, f"that of the server at {self._url} ({options})", got) from None
+                expected = f"that of the server at {self._url} ({options})"
+                raise RepositoryApiError.at(key, expected, got, remedy) from None
             ours = triton.error_from(error, self._url)
             if isinstance(ours, ServerUnavailableError) and ours.remedy and message not in str(ours):  # no connection
                 raise RepositoryApiError(str(ours)) from error

@@ -55,7 +55,7 @@ def test_status_fits_a_terminal(demo_server: Endpoints) -> None:
     url = demo_server.grpc_url
     words, _ = shown(url, "status", "--metrics-url", demo_server.metrics_url)
     heads = {"model", "v", "state", "requests", "failed", "refused", "pending", "batches", "samples", "queue", "ms"}
-    assert heads | {"rfm", "rfm_encoder", "rfm_frames"} <= words
+    assert heads | {"rfm", "rfm_encoder", "rfm_frames", "demo_checkpoint"} <= words
 
 
 def test_scores_and_figures_of_the_toy_checkpoint_say_that_they_mean_nothing(
@@ -64,9 +64,12 @@ def test_scores_and_figures_of_the_toy_checkpoint_say_that_they_mean_nothing(
     words = ("--url", demo_server.grpc_url, "--task", TASK, "--plot", tmp_path / "plot.svg")
     result = invoke("score", video, *words)
     assert (result.exit_code, result.stderr.count(f"note: {TOY}")) == (0, 1)
-    assert f"<!-- {TOY} -->" in (tmp_path / "plot.svg").read_text()
+    assert "demo_checkpoint scored these frames in one pass" in result.stdout
+    drawn = (tmp_path / "plot.svg").read_text()
+    assert all(f"<!-- {line} -->" in drawn for line in ("demo_checkpoint", TOY))
     result = invoke("compare", video, video, *words[:-2])
     assert (result.exit_code, result.stderr.count(f"note: {TOY}")) == (0, 1)
+    assert "demo_checkpoint compared each video" in result.stdout
     result = invoke("score", video, *words, "--caption", "how it went")
     drawn = (tmp_path / "plot.svg").read_text()
     assert all(f"<!-- {line} -->" in drawn for line in ("how it went", TOY))

@@ -304,9 +304,10 @@ def test_a_comparison_names_no_winner_where_the_orders_disagree(
         },
     )
     assert (comparison.ranks, comparison.ranking) == (ranks, ranking)
-    of_videos, of_pairs, *legend = comparison.tables()
+    of_videos, of_pairs, by, *legend = comparison.tables()
     shown = sorted(range(len(ranks)), key=lambda index: -comparison.wins[index])  # rank 3 stands in row 3
     expected = [(f"{index}", f"{index + 1}", str(ranks[index] or "?")) for index in shown]
     assert re.findall(r"^  (\d)\.npz +(\d) +(\S+)", of_videos, re.MULTILINE) == expected
     assert re.findall(r"  (agree|no answer)$", of_pairs, re.MULTILINE) == answers
+    assert by == "  rfm compared each video with every other."
     assert legend == [LEGEND] * (ranking is None)

@@ -36,7 +36,7 @@ def test_every_result_has_a_curve_of_progress_in_one_axes_and_of_success_below()
     assert success.get_xlabel() == "frame"
     assert figure.get_suptitle() == '"stack the cups"'
     told = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert told == ["a_$1.mp4", f"{'b' * 21}…{'b' * 22}"]
+    assert told == ["a_$1.mp4", f"{'b' * 21}…{'b' * 22}", "success if last ≥ 0.5"]
 
 
 def test_seconds_stand_on_the_axis_if_all_are_known_and_success_only_if_predicted() -> None:
@@ -59,7 +59,7 @@ def test_a_model_of_remaining_seconds_has_an_axis_in_seconds_beside_that_of_prog
     np.testing.assert_array_equal(line.get_ydata(), [30, 12, 1])
     assert of_seconds.get_ylim()[1] > 30
     assert len(progress.get_lines()) == 1
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "b"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "b", "success if last ≥ 0.5"]
 
 
 def test_the_colours_are_those_of_the_page_and_no_axes_are_boxed() -> None:

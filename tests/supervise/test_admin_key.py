@@ -46,7 +46,8 @@ def test_the_server_changes_nothing_without_its_key(served: Served, tmp_path: Pa
     key_file.write_text(shown or "")
     words = ["--url", url, *(["--admin-key-file", str(key_file)] if shown else [])]
     done = rfm("models", "list", *words)
-    hint = f"(--admin-key-file or {VARIABLE}), got {'another' if shown else 'none'}"
+    hint = f"(--admin-key-file or {VARIABLE}), got {'another' if shown else 'none'}; "
+    hint += "a server started without one takes none: start it again with --admin-key-file"
     assert (done.exit_code, done.stderr) == (1, f"rfm: admin key: expected that of the server at {url} {hint}\n")
 
 

@@ -297,7 +297,8 @@ def user_message(error: Exception) -> str:
     """Return the message for a command-line user, who knows options but not Python function arguments."""
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}"
-    return str(with_remedy(error, "leave --no-subsample out, or score prefixes (--sampling)"))
+    prefixes = "score prefixes of fewer frames (rfm-client score --sampling rint_pad)"
+    return str(with_remedy(error, f"leave out --no-subsample, or {prefixes}"))
 
 
 def with_remedy(error: Exception, remedy: str) -> Exception:

@@ -110,9 +110,9 @@ def score(
     with nullcontext() if output.rrd is None else Recording(output.rrd) as recording, server.connected() as client:
         video.check_read(client)
         outcomes = scoring.SourceScorer(client, video, prefix, recording).score_all(videos, tell)
-    if output.prints_tables and shown:
-        print("\n" + wrapped(prefix.rule, "  ", "  "))
     infos = [outcome.info for outcome in shown]
+    if output.prints_tables and shown:
+        print("\n" + wrapped(prefix.rule(scoring.checkpoint_names(infos)), "  ", "  "))
     scoring.report_warnings(infos)
     output.write_json(documents.score_document(server, video, prefix, outcomes))
     title = scoring.heading(video.task, infos, output.caption)
@@ -184,7 +184,10 @@ def status(
             for url in server.urls
         ]
     if output.prints_tables:
-        typer.echo("\n".join(map(status_tables, statuses)))
+        for each in statuses:
+            typer.echo(status_tables(each))
+            for model in each.checkpoints:
+                typer.echo(_checkpoint(server, each.url, model))
     output.write_json(documents.status_document(statuses))
 
 
@@ -251,6 +254,15 @@ def bench(load: Load, output: JsonOutput, server: ServerOptions) -> None:
         typer.echo(measured.report(load))
     output.write_json({**server.origin, **asdict(load), **asdict(measured), "held": measured.is_held})
     raise typer.Exit(ExitCode.OK if measured.is_held else ExitCode.FAILED)
+
+
+def _checkpoint(server: StatusOptions, url: str, model: str) -> str:
+    """Return a line for the user: which checkpoint the model is."""
+    try:
+        with server.client(url, model=model, retry=False) as client:
+            return wrapped(f"checkpoint of {model}: {scoring.checkpoint_name(client.model_info(frames=True))}")
+    except RewardError as error:
+        return wrapped(f"checkpoint of {model}: {error}")
 
 
 def _report_subsampled(name: str, num_scored: int, num_frames: int) -> None:

@@ -10,7 +10,7 @@ from typing import cast
 
 from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.scoring import Source, checkpoint_name, report_warnings
-from rfm_client.cli.show import at_end, number, table, title_at_end
+from rfm_client.cli.show import at_end, number, table, title_at_end, wrapped
 from rfm_client.client import RewardClient
 from rfm_client.contract.description import ModelInfo
 from rfm_client.contract.errors import InvalidSampleError
@@ -20,8 +20,8 @@ from rfm_client.contract.samples import PreferenceSample, ProgressSample, Trajec
 from rfm_client.frames.fit_to_checkpoint import fitted, with_frame_indices
 
 LEGEND = (
-    "no answer: the orders disagree, or both are exactly 0.5.\n"
-    "No rank (?): one of the video's pairs has no answer, or another wins as often."
+    "  no answer: the orders disagree, or both are exactly 0.5.\n"
+    "  No rank (?): one of the video's pairs has no answer, or another wins as often."
 )
 
 
@@ -37,13 +37,14 @@ class Comparison(Ranking):
     scores: Sequence[ProgressResult]
 
     def tables(self) -> list[str]:
-        """Return a table of sources, best first, a table of pairs by number, and without a ranking a legend."""
+        """Return tables of sources, best first, and of pairs, the checkpoint, and without a ranking a legend."""
         best_first = sorted(self.numbers, key=self.wins.__getitem__, reverse=True)
         columns = ("video", "#", "rank", "P(wins)", title_at_end(self.scores[0]), "final success", "frames")
         pairs = ("first", "second", "P(first wins)", "order swapped", "mean", "orders")
         return [
             table("", columns, [self._row(index) for index in best_first]),
             table("", pairs, [self._pair_row(*couple) for couple in self.couples()]),
+            wrapped(f"{checkpoint_name(self.info)} compared each video with every other.", "  ", "  "),
             *([LEGEND] if self.ranking is None else []),
         ]
 

@@ -107,8 +107,8 @@ class ServerOptions(CredentialFiles):
     def client(self, *urls: str, **options: Any) -> RewardClient:
         """Return a client for these servers, else for all. Raises typer.BadParameter for an invalid URL."""
         with usage_errors("--url"):
-            given = {"timeout_s": self.timeout_s, **self.credentials.options, **options}
-            return RewardClient(urls or self.urls, model=self.model, **given)
+            given = {"model": self.model, "timeout_s": self.timeout_s, **self.credentials.options, **options}
+            return RewardClient(urls or self.urls, **given)
 
     @contextmanager
     def connected(self, **options: Any) -> Iterator[RewardClient]:
@@ -226,7 +226,7 @@ class PrefixOptions(Settings):
     sampling: Rule | None = setting(
         None,
         f"Score each frame on its prefix, sampled by a rule of docs/guides/choose_frames.md ({', '.join(RULES)}); else "
-        "all frames in one pass.",
+        "score in one pass.",
         metavar="RULE",
     )
     frames: int | None = setting(None, "Frames per prefix (with --sampling). Default: as in training.", least=1)
@@ -242,13 +242,12 @@ class PrefixOptions(Settings):
         except InvalidValueError as error:
             raise ConfigError.like(error) from None
 
-    @property
-    def rule(self) -> str:
-        """A line for the user: which frames decide a frame's score."""
+    def rule(self, checkpoints: str) -> str:
+        """Return a line for the user: which checkpoints scored, and which frames decide a frame's score."""
         if self.sampling is not None:
             frames = f", {self.frames} frames" if self.frames else ""
-            return f"Each frame is scored on its prefix: {self.sampling}{frames}."
-        return "All frames in one pass; labels and the page score each prefix (--sampling)."
+            return f"{checkpoints} scored each frame on its prefix: {self.sampling}{frames}."
+        return f"{checkpoints} scored these frames in one pass; labels and the page score each prefix (--sampling)."
 
 
 @dataclass(frozen=True)

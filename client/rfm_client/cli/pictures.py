@@ -229,8 +229,7 @@ def _draw_curves(axes: Axes, panel: Panel, height_in: float) -> None:
             style: dict[str, Any] = {"color": COLOURS[name], "marker": "o", "markersize": size}
             handles += own.plot(positions, scores[known], label=label, clip_on=False, **style)
             if name == "success":
-                label = f"threshold {SUCCESS_THRESHOLD}"
-                handles.append(own.axhline(SUCCESS_THRESHOLD, **THRESHOLD, label=label))
+                handles.append(own.axhline(SUCCESS_THRESHOLD, **THRESHOLD))
     if leading.unit:
         axes.set_ylabel(leading.title(panel.scores.leading))
         axes.set_ylim(bottom=min(0.0, float(np.nanmin(panel.scores.arrays[panel.scores.leading]))))

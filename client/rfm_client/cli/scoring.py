@@ -218,10 +218,15 @@ def _evaluate(
 
 
 def heading(task: str, infos: Iterable[ModelInfo], caption: str | None = None) -> str:
-    """Return a figure's title: the caption, else the task and the checkpoints; a warning replaces a name."""
-    title = f'"{task}"' * (not is_blank(task)) if caption is None else caption
-    told = (info.warning or (checkpoint_name(info) if caption is None else "") for info in infos)
-    return "\n".join(filter(None, [title, ", ".join(filter(None, dict.fromkeys(told)))]))
+    """Return a figure's title: the caption, else the task and the checkpoints; below it their warnings."""
+    infos = list(infos)
+    title = [f'"{task}"' * (not is_blank(task)), checkpoint_names(infos)] if caption is None else [caption]
+    return "\n".join(filter(None, [*title, *dict.fromkeys(info.warning for info in infos)]))
+
+
+def checkpoint_names(infos: Iterable[ModelInfo]) -> str:
+    """Return the names of these checkpoints, each once."""
+    return ", ".join(dict.fromkeys(map(checkpoint_name, infos)))
 
 
 def checkpoint_name(info: ModelInfo) -> str:

@@ -174,7 +174,7 @@ class SampleScorer:
         if not self._checks_lengths or limit is None or num_frames <= limit or info.needs_whole_episode:
             return
         self._checks_lengths = False
-        remedy = f"score {limit} of them (subsample=True), or each frame on its prefix (frame_steps or a sampling rule)"
+        remedy = f"score {limit} of them (subsample), or each frame on at most {limit} (frame_steps or sampling)"
         expected = "trajectory: expected at most %d frames, as in the training of %s, got %d: %s (logged once)"
         logger.warning(expected, limit, info.source or info.name, num_frames, remedy)
 
