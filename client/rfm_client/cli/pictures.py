@@ -30,7 +30,7 @@ COLUMN_WIDTH_IN = 4.8  # width of panels side by side
 # inches within a panel
 _LEFT, _RIGHT = 0.5, 0.4
 _TITLE, _STRIP_GAP, _BELOW = 0.22, 0.1, 0.5
-_CURVES, _LEAST_CURVES, _LEAST_PANEL = 1.3, 0.9, 3.8
+_CURVES, _LEAST_CURVES, _LEAST_PANEL = 1.3, 0.9, 4.3
 _HIGHEST_FRAME = 1.2
 _FRAME_SHARE = 0.97  # of the room between frames; the rest is a gap
 _HEADLINE = 0.17  # a line in the figure's title
