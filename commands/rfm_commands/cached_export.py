@@ -53,6 +53,8 @@ def exported(settings: ExportConfig) -> Path:
     folder = Path(str(settings.checkpoint))
     if not has_checkpoint(folder) and (inner := checkpoint_in(folder)):
         fail(f"checkpoint: expected a checkpoint, got {folder}, a folder that holds one; name {inner}")
+    if models_in(folder):
+        fail(f"checkpoint: expected a checkpoint, got {folder}, a repository: name it with --repository")
     command = [sys.executable, "-m", __name__, json.dumps(vars(settings))]
     with stopped_by_signals():
         group = ProcessGroup(command, stdout=subprocess.PIPE)
