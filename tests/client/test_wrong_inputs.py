@@ -159,6 +159,9 @@ FAILURES = {
         *(1, "checkpoint: expected a checkpoint, got early, a folder that holds one; name "),
         EARLY,
     ),
+    "rfm serve --checkpoint repository": (
+        *(1, "checkpoint: expected a checkpoint, got repository, a repository: name it with --repository"),
+    ),
     "rfm try nope.mp4 --task x": (
         *(1, "repository: expected a folder of models, got model_repository, which is not there: rfm export "),
         "--checkpoint CHECKPOINT --repository model_repository writes one; --checkpoint robometer/Robometer-4B ",
