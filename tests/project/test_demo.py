@@ -102,7 +102,7 @@ def test_a_checkpoint_of_one_s_own_scores_a_video(tmp_path: Path, monkeypatch: p
     served = f"rfm serve {checkpoint} --image-encoder {encoders / 'image_encoder'} --text-encoder "
     for shown in (TOY, clip.TASK, "clip.mp4", "32 frames", public, served, "text_encoder --gateway-port 8100\n"):
         assert shown in result.output
-    assert (tmp_path / "clip.rfm.png").read_bytes().startswith(PNG)
+    assert (tmp_path / "clip.1.checkpoint.png").read_bytes().startswith(PNG)
 
 
 @pytest.mark.nightly
