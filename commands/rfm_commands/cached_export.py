@@ -13,9 +13,8 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, redirect_stdout, suppress
-from functools import partial
+from collections.abc import Mapping
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -107,8 +106,8 @@ def find_or_export(settings: ExportConfig, folder: Path) -> Path:
             return _digest(source, hub.look(source, tell), settings, gpus) == digest
 
         if not repository.exists():
-            wait = partial(say, f"another start exports {source}: waiting")
-            with alone(home, wait), _kept_if_filled(home), staging(home, ()) as scratch:
+            home.mkdir(parents=True, exist_ok=True)
+            with alone(home, lambda: say(f"another start exports {source}: waiting")), staging(home, ()) as scratch:
                 if not repository.exists():
                     expected = list(needs(found, settings, gpus, folder))
                     for need in expected:
@@ -131,17 +130,6 @@ def find_or_export(settings: ExportConfig, folder: Path) -> Path:
         tell(line)
     say(f"{source}: served from its export {repository}")
     return repository
-
-
-@contextmanager
-def _kept_if_filled(folder: Path) -> Iterator[None]:
-    """Remove the folder after the block if it is empty."""
-    folder.mkdir(exist_ok=True)  # another start, which held the lock, may have removed it
-    try:
-        yield
-    finally:
-        with suppress(OSError):  # it has an export
-            folder.rmdir()
 
 
 def _digest(source: str, found: Found, settings: ExportConfig, gpus: int) -> str:

@@ -123,9 +123,9 @@ def _existing(folder: Path) -> Path:
 
 
 def size(number: float) -> str:
-    """Return bytes as text in GB or MB, with two digits."""
+    """Return bytes as text in GB or MB, with three digits."""
     unit, name = (_GB, "GB") if number >= _GB else (_MB, "MB")
-    return f"{float(f'{number / unit:.2g}'):g} {name}"
+    return f"{float(f'{number / unit:.3g}'):g} {name}"
 
 
 def _duration(seconds: float) -> str:

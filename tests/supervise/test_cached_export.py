@@ -151,7 +151,7 @@ def test_a_better_tag_of_the_hub_gives_another_export_and_without_the_hub_the_ca
         first = find_or_export(settings, cache)
         told = capsys.readouterr().err
         size_mb = sum(file.stat().st_size for file in checkpoint.iterdir()) / 1e6
-        assert f"rfm: download: {size_mb:.2g} MB, less than a second at 15 MB/s\n" in told
+        assert f"rfm: download: {size_mb:.3g} MB, less than a second at 15 MB/s\n" in told
         assert find_or_export(settings, cache) == first
         assert BEGINS not in capsys.readouterr().err
         revisions["best-p-0.7-step-2"] = checkpoint
@@ -239,26 +239,26 @@ def test_a_start_says_what_it_takes_and_refuses_too_little_memory_before_the_dow
     with pytest.raises(ExportError) as refused:
         find_or_export(ExportConfig(checkpoint=source, num_gpus=0), cache)
     assert str(refused.value) == (
-        "memory: expected at least 38 GB, got 16 GB free; use a machine with more, or with a GPU; rfm export tries it all the same"
+        "memory: expected at least 38.3 GB, got 16 GB free; use a machine with more, or with a GPU; rfm export tries it all the same"
     )
     told = re.sub(r"[\d.]+ GB are free", "N GB are free", capsys.readouterr().err)
     assert told.splitlines() == [
         "rfm: download: 8.9 GB, about 10 minutes at 15 MB/s",
         f"rfm: disk: 8.9 GB in {hub_cache}; N GB are free",
         f"rfm: disk: 8.9 GB in {cache}; N GB are free",
-        "rfm: memory: about 51 GB to export, then 27 GB to serve; N GB are free",
+        "rfm: memory: about 51.1 GB to export, then 27.4 GB to serve; N GB are free",
         "rfm: no GPU: the CPU takes about 13 s for a sample with 8 frames of 224x224, by an estimate",
     ]
     assert not list(hub_cache.rglob("*.safetensors"))
-    assert not list(cache.iterdir())
+    assert not exports(cache)
 
 
 LARGE = Found((), {"model.safetensors": 8_900_000_000})
 REFUSED = {
     "a disk": (0, 200, {"free": 8}, r"disk of .*: expected at least 8\.9 GB, got 8 GB free; make room, or set XDG"),
     "a GPU": (8, 200, {}, r"GPU memory: expected at least 8\.9 GB, got 8 GB free; --weights int8 halves them, or "),
-    "memory beside a GPU": (80, 12, {}, r"memory: expected at least 18 GB, got 12 GB free; use a machine"),
-    "memory beside a small GPU": (10, 30, {}, r"memory: expected at least 38 GB, got 30 GB free; use a mach"),
+    "memory beside a GPU": (80, 12, {}, r"memory: expected at least 17.7 GB, got 12 GB free; use a machine"),
+    "memory beside a small GPU": (10, 30, {}, r"memory: expected at least 38.3 GB, got 30 GB free; use a mach"),
     "nothing": (80, 20, {}, ""),
 }
 
