@@ -19,8 +19,8 @@ from rfm_labels.datasets.tasks_table import read_csv
 
 _EPISODE, _SUCCESS = "episode", "success"  # columns in an outcomes CSV
 _MEANINGS = {
-    **dict.fromkeys(("true", "1", "success", "successful", "succeeded"), True),
-    **dict.fromkeys(("false", "0", "failure", "failed", "fail", "unsuccessful"), False),
+    **dict.fromkeys(("true", "1", "yes", "y", "success", "successful", "succeeded"), True),
+    **dict.fromkeys(("false", "0", "no", "n", "failure", "failed", "fail", "unsuccessful"), False),
     **dict.fromkeys(("", "nan", "none", "suboptimal"), None),  # suboptimal: it may have ended well or not
 }
 _COSTS = {"-1": False, "0": True}  # rewards of -1 until success
@@ -32,8 +32,9 @@ def read_outcomes(
 ) -> dict[Any, bool | None]:
     """Return each episode's outcome by number, in a CSV file by name if ``names`` lack it; None: unknown.
 
-    An episode succeeds if any of its frames does, as in LeRobot's evaluation. Values: true, false, 1, 0; rewards of 1
-    and 0, or of 0 and -1; success, failure and similar words; null, NaN, an empty cell or "suboptimal" for unknown.
+    An episode succeeds if any of its frames does, as in LeRobot's evaluation. Values: true, false, 1, 0, yes, no;
+    rewards of 1 and 0, or 0 and -1; success, failure and similar words; null, NaN, an empty cell or "suboptimal" for
+    unknown.
 
     source: a CSV file with the columns ``episode`` (a number, a name, or both as tables show them: ``0 (red_cup.mp4)``)
         and ``success``; a LeRobot column, per frame or per episode; an attribute or array of each demonstration in an
