@@ -45,6 +45,9 @@ class EngineScorer:
         on = device_named(device)
         loaded = published.read(source, **options)
         self._checkpoint, self._encoders = loaded.checkpoint, loaded.encoders()
+        if self._encoders is None and self._checkpoint.description.widths is not None:  # else each episode would say so
+            remedy = "name them with --image-encoder and --text-encoder"
+            raise CheckpointError.at(source, "encoders, since it scores embeddings", "none", remedy)
         settings = {"device": on.type, **{name: _named(value) for name, value in options.items()}}
         settings |= {} if dtype is None else {"dtype": str(dtype)}
         newer = [name for name in self._checkpoint.description.more_scores if FRAME_SCORES[name].is_newer]

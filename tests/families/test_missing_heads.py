@@ -173,18 +173,19 @@ def test_a_checkpoint_of_the_first_rewind_code_has_its_scores(first_code: tuple[
             published.load(folder, **{option: "some/other"})
 
 
-def test_a_checkpoint_of_the_first_rewind_code_is_exported_and_labels(run: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_of_the_first_rewind_code_is_exported_and_cannot_label(run: Path, tmp_path: Path) -> None:
     (run / "config.json").write_text('{"max_len": 32}')
     rfm_export.export(run, tmp_path / "repository", serve_config(goldens.config(REWIND)))
     loaded = published.read(run)
     exported = published.load(tmp_path / "repository" / "rfm" / "1" / "checkpoint")
     assert exported.config == loaded.checkpoint.config
     assert exported.config.trained_frames == 32
-    scorer = EngineScorer(str(run))
-    assert scorer.checkpoint().max_frames == 32
-    assert "causal_mask" in scorer.notes[1]
-    assert "max_len" not in scorer.notes[1]
+    _, assumed = published.notes(run, loaded)
+    assert "causal_mask" in assumed
+    assert "max_len" not in assumed
     assert [each.name for each in loaded.assumptions] == ["num_attention_heads", "causal_mask"]
+    with pytest.raises(CheckpointError, match="expected encoders, since it scores embeddings, got none"):
+        EngineScorer(str(run))
 
 
 def test_a_checkpoint_of_the_first_rewind_code_is_causal_whatever_upstream_s_older_files_mean(run: Path) -> None:

@@ -174,9 +174,10 @@ def test_outcomes_are_read_from_a_table_the_frames_or_the_episodes(tmp_path: Pat
 
 
 def test_a_table_of_outcomes_has_numbers_or_names_as_tables_show_them(tmp_path: Path) -> None:
-    rows = "red_cup.mp4,1\n1 (2),0\n3,1\n4 (blue_cup.mp4),0\n7,1\ngone.mp4,0\n"
-    outcomes = read_outcomes(written(tmp_path / "a.csv", f"episode,success\n{rows}"), names=NAMES)
-    assert outcomes == {0: True, 1: False, 3: True, 4: False, 7: True, "gone.mp4": False}
+    rows = "red_cup.mp4,1\n1 (2),no\n3,Yes\n4 (blue_cup.mp4),0\n7,1\ngone.mp4,0\n"
+    for column in ("episode", "video", "episode_index"):
+        outcomes = read_outcomes(written(tmp_path / "a.csv", f"{column},success\n{rows}"), names=NAMES)
+        assert outcomes == {0: True, 1: False, 3: True, 4: False, 7: True, "gone.mp4": False}
 
 
 def with_column(folder: Path, name: str, value: Callable[[int, bool], Any]) -> Path:

@@ -71,7 +71,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "a folder of other files": (
         lambda root: [(root / "3").mkdir(), (root / "3" / "a.txt").write_text("a")],
-        "3: expected PNG or JPEG files, got other files: leave it out (--episodes)",
+        "3: expected PNG or JPEG files, got a.txt: name videos by a pattern (--videos), or leave it out (--episodes)",
     ),
     "folders of cameras": (
         lambda root: write_frames(root / "3" / "front", numbered(2)),

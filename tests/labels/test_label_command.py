@@ -76,7 +76,8 @@ def test_both_commands_write_the_same_labels_and_print_their_decisions(demo_serv
 
 @pytest.mark.triton
 def test_a_dry_run_prints_the_plan_and_writes_nothing(demo_server: Endpoints, output: Path) -> None:
-    result = invoke("label", DATASET, "--dry-run", "--output", output, "--url", demo_server.grpc_url)
+    cameras = ("--cameras", "front", "--cameras", "wrist")
+    result = invoke("label", DATASET, *cameras, "--dry-run", "--output", output, "--url", demo_server.grpc_url)
     assert result.exit_code == 0, result.stderr
     told = cells(result.stdout)
     assert told["dataset"] == "LeRobot v3.0: toy_v30_many"
@@ -114,6 +115,12 @@ def test_outputs_that_the_training_run_did_not_train_are_listed(output: Path) ->
         "rfm: config.yaml: model.train_success_head",
         "rfm: config.yaml: loss.predict_last_frame_progress",
     ]
+
+
+def test_a_checkpoint_without_its_encoders_is_refused_before_the_first_episode(output: Path) -> None:
+    result = own(DATASET, *ENGINE[:2], "--output", output)
+    got = "expected encoders, since it scores embeddings, got none; name them with --image-encoder and --text-encoder"
+    assert (result.exit_code, result.stderr) == (1, f"rfm: {ENGINE[1]}: {got}\n")
 
 
 WRONG = {

@@ -145,6 +145,7 @@ def test_advantages_follow_recap_within_each_stretch_of_frames(root: Path, outpu
     np.testing.assert_allclose(recap_advantages(progress, 2, 4), [-0.1, -0.4, -0.45, 0.0], atol=1e-7)
 
     chosen = options(output, mode="whole", frames=None, formats=("progress", "signals"), advantage=5)
+    label(open_dataset(root), Rising(max_frames=None), replace(chosen, advantage=None))  # may be added later
     report = label(open_dataset(root), Rising(max_frames=None), chosen)
     table, signals = map(parquet.read_table, report.files)
     advantages, length, horizon = table["advantage"].to_numpy(), 20, 5
@@ -152,5 +153,6 @@ def test_advantages_follow_recap_within_each_stretch_of_frames(root: Path, outpu
     steps = 58 - 30 - 1  # in the third stretch, the longest of the first task
     np.testing.assert_allclose(advantages[:length], left * (0.8 / (length - 1) - 1 / steps), atol=1e-6)
     np.testing.assert_array_equal(signals["reward.rfm.advantage"].to_numpy(), advantages)
-    with pytest.raises(DatasetError, match=r"advantage\.frames: 5 there, 7 now"):
-        label(open_dataset(root), Rising(max_frames=None), replace(chosen, advantage=7))
+    for other, message in ((7, r"advantage\.frames: 5 there, 7 now"), (None, r"advantage\.frames: 5 there, none now")):
+        with pytest.raises(DatasetError, match=message):
+            label(open_dataset(root), Rising(max_frames=None), replace(chosen, advantage=other))

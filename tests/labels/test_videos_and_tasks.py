@@ -63,7 +63,8 @@ def test_videos_missing_from_the_table_are_listed(videos: Path, output: Path) ->
     label(open_dataset(videos), BrightnessScorer(), LabelOptions(output=output), notes)
     line = "tasks.csv leaves out videos beside it, which get no labels: b.mp4, day/c.mp4"
     assert [each for each in notes.lines if "tasks.csv" in each] == [line]
-    (videos / "tasks.csv").write_text("video,task\nb.mp4,a b\nday/a.mp4,open the box\nday/c.mp4,c d\n")
+    listed = f"{videos.absolute()}/b.mp4,a b\nday/a.mp4,open the box\nday/c.mp4,c d\n"
+    (videos / "tasks.csv").write_text(f"video,task\n{listed}")
     assert not open_dataset(videos).notes
 
 

@@ -252,6 +252,8 @@ class LabelFile:
     def check(self, plan: Plan) -> None:
         """Raise DatasetError unless the plan reproduces all labels in the file by the same recipe."""
         there, now = _settings(_recipe(self.provenance)), _settings(_recipe(plan.provenance()))
+        if "advantage" not in self.provenance:  # the plan may add it
+            now = {name: value for name, value in now.items() if not name.startswith("advantage.")}
         names = [name for name in dict.fromkeys([*now, *there]) if there.get(name) != now.get(name)]
         differ = "; ".join(f"{name}: {there.get(name, 'none')} there, {now.get(name, 'none')} now" for name in names)
         got = differ if self.provenance else "labels of another program"

@@ -17,10 +17,10 @@ from rfm_labels.datasets.lerobot_meta import EPISODES_FILE, column_types, json_l
 from rfm_labels.datasets.readers import is_reader, read_episodes
 from rfm_labels.datasets.tasks_table import read_csv
 
-_EPISODE, _SUCCESS = "episode", "success"  # columns in an outcomes CSV
+_EPISODES, _SUCCESS = ("episode", "video", "episode_index"), "success"  # columns in an outcomes CSV
 _MEANINGS = {
-    **dict.fromkeys(("true", "1", "success", "successful", "succeeded"), True),
-    **dict.fromkeys(("false", "0", "failure", "failed", "fail", "unsuccessful"), False),
+    **dict.fromkeys(("true", "1", "yes", "y", "success", "successful", "succeeded"), True),
+    **dict.fromkeys(("false", "0", "no", "n", "failure", "failed", "fail", "unsuccessful"), False),
     **dict.fromkeys(("", "nan", "none", "suboptimal"), None),  # suboptimal: it may have ended well or not
 }
 _COSTS = {"-1": False, "0": True}  # rewards of -1 until success
@@ -32,12 +32,13 @@ def read_outcomes(
 ) -> dict[Any, bool | None]:
     """Return each episode's outcome by number, in a CSV file by name if ``names`` lack it; None: unknown.
 
-    An episode succeeds if any of its frames does, as in LeRobot's evaluation. Values: true, false, 1, 0; rewards of 1
-    and 0, or of 0 and -1; success, failure and similar words; null, NaN, an empty cell or "suboptimal" for unknown.
+    An episode succeeds if any of its frames does, as in LeRobot's evaluation. Values: true, false, 1, 0, yes, no;
+    rewards of 1 and 0, or 0 and -1; success, failure and similar words; null, NaN, an empty cell or "suboptimal" for
+    unknown.
 
-    source: a CSV file with the columns ``episode`` (a number, a name, or both as tables show them: ``0 (red_cup.mp4)``)
-        and ``success``; a LeRobot column, per frame or per episode; an attribute or array of each demonstration in an
-        HDF5 file; or a reader, ``FILE.py:FUNCTION``
+    source: a CSV file with the columns ``episode`` (a number, a name, or both as tables show them: ``0 (red_cup.mp4)``;
+        also called ``video`` or ``episode_index``) and ``success``; a LeRobot column, per frame or per episode; an
+        attribute or array of each demonstration in an HDF5 file; or a reader, ``FILE.py:FUNCTION``
     dataset: the LeRobot folder, the HDF5 file, or the folder of the reader's recordings
     names: of the labelled episodes, by number, which a reader must give in the same order; None: unchecked
 
@@ -66,16 +67,17 @@ def _of_csv(file: Path, names: Mapping[int, str]) -> Stored:
     known = {text: number for number, name in names.items() for text in (name, named(number, name))}
     columns, rows = read_csv(file)
     got = ", ".join(columns) if rows else "no rows"
-    require(file, bool(rows) and {_EPISODE, _SUCCESS} <= {*columns}, f"the columns {_EPISODE} and {_SUCCESS}", got)
+    name = next((each for each in _EPISODES if each in columns), _EPISODES[0])
+    require(file, bool(rows) and {name, _SUCCESS} <= {*columns}, f"the columns {name} and {_SUCCESS}", got)
     stored: dict[Any, tuple[str, Sequence[Any]]] = {}
     for where, cells in rows:
         row = dict(zip(columns, cells, strict=False))
-        text = row.get(_EPISODE, "").strip()
+        text = row.get(name, "").strip()
         episode: Any = int(text) if text.isdecimal() else known.get(text, text)
         other = known.get(text, episode)
         either = f": write {named(other, text)} or {named(episode, names.get(episode))}" if other != episode else ""
         is_one = bool(text) and not either
-        require(f"{where}: {_EPISODE}", is_one, "the number or name of one episode", f"{text!r}{either}")
+        require(f"{where}: {name}", is_one, "the number or name of one episode", f"{text!r}{either}")
         require(where, episode not in stored, "each episode once", f"{text} again")
         stored[episode] = f"{where}: {_SUCCESS}", [row.get(_SUCCESS)]
     return stored

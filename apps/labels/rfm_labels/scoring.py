@@ -126,7 +126,8 @@ class Run:
             planned, now = self._plan.recipe.checkpoint, self._scorer.checkpoint()
             for name in DECISIVE:
                 if getattr(now, name) != getattr(planned, name):
-                    raise InvalidSampleError.at(name, getattr(planned, name), getattr(now, name))
+                    remedy = "the server changed its checkpoint; the same command scores all episodes by the new one"
+                    raise InvalidSampleError.at(name, getattr(planned, name), getattr(now, name), remedy)
         except InvalidSampleError as error:
             self._stop(error)
             raise _StoppedError from error

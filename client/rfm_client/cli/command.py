@@ -239,7 +239,7 @@ def _parameter(setting: Setting) -> inspect.Parameter:
         show_envvar=False,  # ``help`` shows it
         rich_help_panel=setting.title,
     )
-    kind = str if setting.parse else list[str] if setting.kind == Texts else setting.kind
+    kind = list[str] if setting.parse or setting.kind == Texts else setting.kind
     return inspect.Parameter(
         _key(setting),
         inspect.Parameter.KEYWORD_ONLY,
@@ -272,7 +272,7 @@ def _given(options: Sequence[Setting], values: dict[str, Any]) -> OptionValues[A
         if value in (None, []):
             continue
         with usage_errors(each.option):
-            value = each.parse(value) if each.parse else value
+            value = each.parse(",".join(value)) if each.parse else value
         given[each.name] = tuple(value) if isinstance(value, list) else value
     return given
 

@@ -15,7 +15,7 @@ from rfm_client.options import counted, first_names, setting
 if TYPE_CHECKING:
     from rfm_labels import LabelComparison
 
-VOC = "VOC: rank correlation of progress with time, mean over {}. "
+VOC = "VOC: rank correlation of progress with time, mean over {}; no VOC: episodes of constant progress. "
 BY_OUTCOME = (
     "AUROC: of success, by the vote of the last three frames, and of progress at the last frame; 0.5 is chance. "
     "Threshold: of the vote, or else of progress, with the best balanced accuracy. "

@@ -149,7 +149,9 @@ def pictures_in(folder: Path) -> list[Path]:
         raise DatasetError.at(folder, "a folder of PNG or JPEG files", got) from error
     names = [each.name for each in found if is_picture(each)]
     folders = in_natural_order([each.name for each in found if each.is_dir()])
-    got = f"an empty folder: {_LEAVE_OUT}" if not found else f"other files: {_LEAVE_OUT}"
+    names_there = first_names(sorted(each.name for each in found), 3)
+    got = f"{names_there}: name videos by a pattern (--videos), or {_LEAVE_OUT}"
+    got = got if found else f"an empty folder: {_LEAVE_OUT}"
     if folders:
         remedy = "if they are cameras, --videos '{episode}/{camera}/*.png' names their pictures"
         got = f"the folders {', '.join(folders[:3])}: {remedy}; or {_LEAVE_OUT}"
