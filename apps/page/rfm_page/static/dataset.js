@@ -31,7 +31,11 @@ export class DatasetTab {
   #failedAnywhere;
   #places;
   #histogram;
-  #previews = new Previews(({ episode }) => previewOf(this.#number, episode, this.#labels, this.#loading.signal));
+  #previews = new Previews(async (episode) => {
+    const told = await previewOf(this.#number, episode.episode, this.#labels, this.#loading.signal);
+    checkSame(episode, told);
+    return told;
+  });
   #loading = new AbortController();
   #table;
   #timeline;
@@ -565,7 +569,7 @@ export class DatasetTab {
     await this.#download(episode, signal);
     if (this.#told.is_on_hub) this.#table.refill(episode); // also after a download that went on without the page
     const told = await Promise.all(names.map((name) => curvesOf(this.#number, episode, name, signal)));
-    if (told[0].name !== this.#watched.name) throw new Error(`episode ${episode}: expected ${this.#watched.name}, got ${told[0].name}: reload the page`);
+    checkSame(this.#watched, { name: told[0].name, num_frames: told[0].times_s.length });
     const curves = [...curvesIn(told[0], null), ...told.slice(1).flatMap((each) => curvesIn(each, other).slice(0, 1))];
     this.#timeline.time = 0;
     this.#showCurves(curves, motionIn(told[0]), curves.length ? curves : [emptyCurve(told[0])]);
@@ -654,6 +658,13 @@ function describe(curves) {
 /** What an episode is called in a file of outcomes: its name, if it has one, since the numbers of a folder change. */
 function idOf({ name, episode }) {
   return name ?? episode;
+}
+
+/** Throws an error if the server has another episode under this number by now. */
+function checkSame(known, { name, num_frames: numFrames }) {
+  if (known.name === name && known.num_frames === numFrames) return;
+  const told = (own, num) => `${own ?? ""} with ${num} frames`.trim();
+  throw new Error(`episode ${known.episode}: expected ${told(known.name, known.num_frames)}, got ${told(name, numFrames)}: reload the page`);
 }
 
 /** What marks of an episode are kept under. One that was recorded again seldom has as many frames. */
