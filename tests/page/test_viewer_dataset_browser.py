@@ -573,7 +573,7 @@ return [...document.querySelectorAll("#curves tr:first-child td")].map((cell) =>
 """
 
 
-@pytest.mark.parametrize("size", [(1440, 900), (1024, 700), (390, 844)], ids=str)
+@pytest.mark.parametrize("size", [(1440, 900), (1024, 700), (820, 1180), (390, 844)], ids=str)
 def test_the_tabs_fit_into_the_window_and_break_no_rule_of_axe_in_either_theme(
     page: Page, size: tuple[int, int]
 ) -> None:

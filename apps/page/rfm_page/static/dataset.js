@@ -402,7 +402,9 @@ export class DatasetTab {
     const page = this.#page;
     const numbers = this.#taken.map(({ episode }) => episode);
     const which = this.#chosen.size ? "selected" : "shown; select rows to export fewer";
-    page["chosen-told"].textContent = `${numbers.length} episodes ${which}`;
+    const told = `${numbers.length} ${numbers.length === 1 ? "episode" : "episodes"}`;
+    page["chosen-told"].textContent = `${told} ${which}`;
+    for (const option of page.use.options) option.textContent = option.textContent.replace(/( \d.*)?$/, ` ${told}`);
     page["choose-none"].disabled = !this.#chosen.size;
     page["episodes-text"].disabled = page["episodes-json"].disabled = !numbers.length;
     const dataset = this.#datasets[this.#number];
@@ -600,6 +602,7 @@ export class DatasetTab {
   /** Shows the curves of an episode, and of its robot. drawn: with one that is not named */
   #showCurves(curves, motion, drawn = curves) {
     const page = this.#page;
+    page["episode-chart"].hidden = !curves.length && motion.length > 0; // nothing would be in it
     page.motion.hidden = !motion.length;
     page["motion-legend"].replaceChildren(...new Map(motion.map((curve) => [curve.label, namedLine(curve)])).values());
     this.#timeline.show(drawn, motion);
