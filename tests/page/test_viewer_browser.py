@@ -376,6 +376,7 @@ def test_a_link_has_the_settings_which_fold_away_and_says_if_its_model_is_not_se
     page.browser.driver.get("about:blank")
     page.browser.open(f"{page.gateway.url}/#model=gone")
     assert page.browser["errors"].text.startswith("The model gone is not served here")
+    assert page.browser["fold"].text == "Hide settings"
     page.browser["fold"].click()
     page.browser.open(page.gateway.url)
     assert not page.browser["question"].is_displayed()  # stays folded

@@ -408,6 +408,7 @@ export class DatasetTab {
     page["choose-none"].disabled = !this.#chosen.size;
     page["episodes-text"].disabled = page["episodes-json"].disabled = !numbers.length;
     const dataset = this.#datasets[this.#number];
+    page.lerobot.hidden = !dataset?.kind.startsWith("LeRobot");
     const all = this.#episodes.map(({ episode }) => episode);
     this.#words = dataset ? lerobotWords(page.use.value, dataset, numbers, all) : "";
     const areFailures = numbers.length > 0 && this.#taken.every(({ never_succeeds: never }) => never);
@@ -666,8 +667,8 @@ function idOf({ name, episode }) {
 /** Throws an error if the server has another episode under this number by now. */
 function checkSame(known, { name, num_frames: numFrames }) {
   if (known.name === name && known.num_frames === numFrames) return;
-  const told = (own, num) => `${own ?? ""} with ${num} frames`.trim();
-  throw new Error(`episode ${known.episode}: expected ${told(known.name, known.num_frames)}, got ${told(name, numFrames)}: reload the page`);
+  const [expected, got] = [[known.name, known.num_frames], [name, numFrames]].map(([own, num]) => `${own ? `${own}, ` : ""}${num} frames`);
+  throw new Error(`episode ${known.episode}: expected ${expected}, got ${got}: reload the page`);
 }
 
 /** What marks of an episode are kept under. One that was recorded again seldom has as many frames. */
