@@ -7,6 +7,7 @@ import csv
 import io
 import itertools
 import json
+import math
 import re
 import shlex
 import subprocess
@@ -266,16 +267,16 @@ def compared(page: Page, *names: str) -> tuple[Any, Any]:
 def test_several_videos_are_ranked_as_by_the_command_line(page: Page) -> None:
     clip.write(page.videos / "nothing.mp4", make_clip("stopped", Task("red", "bowl"), 2_000_002).frames, FPS)
     answer, told = compared(page, "success", "failure", "nothing")
-    best_first = sorted(told["videos"], key=lambda video: -video["wins"])
+    best_first = sorted(told["videos"], key=lambda video: video["rank"] or math.inf)
     assert page.browser.run("return [...document.querySelectorAll('#pairs li')].map((item) => item.textContent)") == [
-        (f"{video['rank']} {video['source']}" if video["rank"] else f"{video['source']} (no rank)")
+        (f"{video['rank']} {video['source']}" if video["rank"] else f"{video['source']}no rank")
         + f"mean preference {video['wins']:.3f}"
         for video in best_first
     ]
     widths = page.browser.run(
         "return [...document.querySelectorAll('#pairs .share')].map((bar) => bar.firstChild.offsetWidth / bar.offsetWidth)"
     )
-    assert widths == pytest.approx([video["wins"] for video in best_first], abs=0.02)
+    assert widths == pytest.approx([video["wins"] for video in best_first if video["rank"]], abs=0.02)
     assert page.browser.run("return document.querySelectorAll('#pairs details p').length") == 3
     commands = page.browser["command"].text.splitlines()
     page.drop("copy")  # which is not among those compared
@@ -375,6 +376,7 @@ def test_a_link_has_the_settings_which_fold_away_and_says_if_its_model_is_not_se
     page.browser.driver.get("about:blank")
     page.browser.open(f"{page.gateway.url}/#model=gone")
     assert page.browser["errors"].text.startswith("The model gone is not served here")
+    assert page.browser["fold"].text == "Hide settings"
     page.browser["fold"].click()
     page.browser.open(page.gateway.url)
     assert not page.browser["question"].is_displayed()  # stays folded
@@ -476,8 +478,14 @@ def test_a_slow_upload_shows_its_percentage_and_then_the_curve_and_a_slow_compar
         page.browser.until("document.getElementById('stop').disabled")
         assert (page.browser["compare"].text, page.browser["stop"].is_displayed()) == ("Compare videos", False)
         assert [page.browser[name].text for name in ("status", "errors")] == ["", ""]
+        page.browser.driver.execute_cdp_cmd("Network.emulateNetworkConditions", link | {"offline": True})
+        page.browser["compare"].click()
+        page.browser.until("document.querySelector('#away .state')")
     finally:
         page.browser.driver.execute_cdp_cmd("Network.emulateNetworkConditions", link | {"uploadThroughput": -1})
+    page.browser.until("!document.querySelector('#away .state')")
+    assert page.browser["errors"].text.startswith("The videos could not be compared")  # also when the server is back
+    assert all("ERR_INTERNET_DISCONNECTED" in line for line in page.browser.complaints())
 
 
 BLOCKED = """

@@ -361,6 +361,15 @@ def test_marked_outcomes_stay_and_evaluate_reads_them(page: Page) -> None:
     assert evaluated(link, "failure.mp4,failure", "success.mp4,success") == ([0, 2], [False, True])
 
 
+OTHER_NAME = """
+const [ask, part] = [fetch, arguments[0]];
+window.fetch = async (path, options) => {
+  const answer = await ask(path, options);
+  return path.includes(part) ? Response.json({ ...await answer.json(), name: "other" }) : answer;
+};
+"""  # what a dataset answers that has been recorded anew: here the browser pretends it
+
+
 def test_an_episode_that_does_not_come_has_an_error_no_curves_and_no_marks(page: Page) -> None:
     browser = page.browser
     page.choose(DEMO)
@@ -383,6 +392,10 @@ def test_an_episode_that_does_not_come_has_an_error_no_curves_and_no_marks(page:
     assert len(page.numbers) == 3
     assert browser["episode-errors"].text == ""
     browser.complaints()  # of the request that was blocked
+    browser.run(OTHER_NAME, "/episodes/5?")
+    browser.run("document.querySelector('#episodes tr[data-episode=\"5\"] button').click()")
+    told = browser.until("document.getElementById('episode-errors').innerText")
+    assert re.search(r"episode 5: expected (\d+) frames, got other, \1 frames: reload the page", told)
 
 
 def test_ten_thousand_episodes_are_a_few_rows_of_the_document(page: Page) -> None:
@@ -547,6 +560,7 @@ def test_an_episode_of_a_folder_of_videos_is_scored_as_it_was_for_the_labels(pag
     page.open_link("#tab=dataset&dataset=clips&episode=1")
     browser.until("!document.getElementById('score-episode').disabled")
     assert browser["episode-told"].text == f"rewound.mp4: {TASK}"
+    assert not browser["lerobot"].is_displayed()
     browser["score-episode"].click()
     browser.until_text("scored", "1 of 1 scored")
     columns = columns_of(root, 1)
@@ -573,7 +587,7 @@ return [...document.querySelectorAll("#curves tr:first-child td")].map((cell) =>
 """
 
 
-@pytest.mark.parametrize("size", [(1440, 900), (1024, 700), (390, 844)], ids=str)
+@pytest.mark.parametrize("size", [(1440, 900), (1024, 700), (820, 1180), (390, 844)], ids=str)
 def test_the_tabs_fit_into_the_window_and_break_no_rule_of_axe_in_either_theme(
     page: Page, size: tuple[int, int]
 ) -> None:

@@ -589,6 +589,49 @@ def test_names_and_tasks_are_shown_as_they_are_now_and_labels_follow_the_names(t
         assert {row["task"] for row in rows().values()} == {given}
 
 
+def add_demonstration(file: Path) -> None:
+    with h5py.File(file, "r+") as opened:
+        opened.copy("data/demo_3", "data/demo_77")
+
+
+def add_line(root: Path) -> None:
+    file = root / "meta" / "episodes.jsonl"
+    file.write_text(file.read_text() + '{"episode_index": 77, "tasks": ["push"], "length": 5}\n')
+
+
+def add_recording(root: Path) -> None:
+    (root / "later").mkdir()
+    clip.write(root / "later" / "new.mp4", writers.video(4), 5)
+
+
+READER = """from rfm_labels import Episode
+
+def episodes(folder):
+    return [Episode(file.stem, {"front": file}, "push") for file in sorted(folder.glob("**/*.mp4"))]
+"""
+GROWN: dict[str, tuple[Callable[[Path], Path], Callable[[Path], None]]] = {
+    "HDF5": (hdf5, add_demonstration),
+    "LeRobot": (lambda folder: copied("toy_v21", folder), add_line),
+    "reader": (folder_of_videos, add_recording),
+}
+
+
+@pytest.mark.parametrize(("kind", "make", "add"), [(kind, *each) for kind, each in GROWN.items()], ids=GROWN)
+def test_an_episode_that_is_recorded_later_is_listed(
+    tmp_path: Path, kind: str, make: Callable[[Path], Path], add: Callable[[Path], None]
+) -> None:
+    (tmp_path / "reader.py").write_text(READER)
+    root = make(tmp_path)
+    with serving(f"{tmp_path}/reader.py:episodes={root}" if kind == "reader" else root) as get:
+        before = get("/0").json()["episodes"]
+        add(root)
+        *same, new = get("/0").json()["episodes"]
+        assert same == before
+        assert new["episode"] == (2 if kind == "reader" else 77)
+        preview = get(f"/0/episodes/{new['episode']}/preview").json()
+        assert (preview["name"], preview["num_frames"]) == (new["name"], new["num_frames"])
+
+
 def test_tasks_are_those_of_the_reader_or_of_the_table_that_was_opened(tmp_path: Path) -> None:
     reader, folder = at_another_rate(tmp_path).split("=")
     other = Path(folder) / "other.csv"

@@ -208,6 +208,8 @@ class ShownDataset:
     def preview(self, number: int, labels: str | None, take: Callable[[int], object]) -> dict[str, Any]:
         """Return an episode's progress at a few points, and its ``ends`` as JPEG in base64; none: they cannot be read.
 
+        name, num_frames: the episode's, to tell it from one that had this number before
+
         take: see ``video``
         """
         file = self._labels(labels)
@@ -226,7 +228,9 @@ class ShownDataset:
                 correction = self._correction(file, camera)
                 ends = self.ends(self._episode(number), camera)
                 pictures = [_jpeg(correction.applied(frame), take) for frame in ends]
-        return {"progress": [] if progress is None else progress.tolist(), "pictures": pictures}
+        listed = self.dataset.listed(number)
+        about = {"name": listed.own_name, "num_frames": listed.num_frames, "pictures": pictures}
+        return {**about, "progress": [] if progress is None else progress.tolist()}
 
     def ends(self, episode: DatasetEpisode, camera: str) -> list[UInt8Array]:
         """Return the first stored frame, and of a video the last. Raises DatasetError."""

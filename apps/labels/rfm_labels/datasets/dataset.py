@@ -6,6 +6,7 @@ T frames per episode, H x W pixels.
 
 from __future__ import annotations
 
+import os
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -320,9 +321,10 @@ class Dataset(ABC):
     @property
     def listing(self) -> Sequence[DatasetEpisode]:
         """Like ``episodes``, but one that cannot be read has no frames, and a Hub dataset downloads no row table."""
-        return [self._listed(number) for number in self.numbers]
+        return [self.listed(number) for number in self.numbers]
 
-    def _listed(self, number: int) -> DatasetEpisode:
+    def listed(self, number: int) -> DatasetEpisode:
+        """Return the episode as in ``listing``."""
         try:
             return self.episode(number)
         except RewardError:  # raised again if that episode is read
@@ -332,9 +334,27 @@ class Dataset(ABC):
         """Return an episode's name, also of one that cannot be read."""
         return f"episode {number}"
 
-    def as_now(self) -> Dataset:
-        """Return the dataset, opened again if its folder lists other episodes or tasks. Raises DatasetError."""
+    def follow(self, reopen: Callable[[], Dataset]) -> Dataset:
+        """Let ``as_now`` open the dataset again. Returns it."""
+        self._latest, self._reopen, self._marks = self, reopen, self._marks_now()
         return self
+
+    def as_now(self) -> Dataset:
+        """Return the dataset that ``follow`` prepared, opened again if ``listed_in`` changed. Raises DatasetError."""
+        marks = self._marks_now()
+        if marks != self._marks:
+            self._latest, self._marks = self._reopen(), marks
+        return self._latest
+
+    def _marks_now(self) -> list[tuple[str, int, int]]:
+        found = [(file, file.stat()) for file in self.listed_in() if file.exists()]
+        return [(str(file), status.st_ctime_ns, status.st_size) for file, status in found]
+
+    def listed_in(self) -> Iterable[Path]:
+        """Yield the files and folders that change when the dataset gets other episodes or tasks."""
+        for folder, folders, _ in os.walk(self.root):
+            folders[:] = [name for name in folders if not name.startswith(".") and name != SIGNALS_FOLDER]
+            yield Path(folder)
 
     def times_s(self, episode: DatasetEpisode) -> Times | None:
         """Return frame times from the episode's start, float64 [T]; None: unknown. Raises DatasetError."""

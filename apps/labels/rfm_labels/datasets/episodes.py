@@ -220,7 +220,6 @@ class EpisodeDataset(RecordedDataset):
 
     root: folder with the recordings
     where: the table of tasks, the folder that may get one, or the reader's name, for messages
-    reopen: opens the dataset again, for ``as_now``; None: it stays as it is
 
     Raises DatasetError for a name twice, functions that several episodes share, and too large arrays.
     """
@@ -234,10 +233,9 @@ class EpisodeDataset(RecordedDataset):
         task: TaskOverride,
         corrections: AskedCorrections,
         notes: Sequence[str] = (),
-        reopen: Callable[[], EpisodeDataset] | None = None,
     ) -> None:
         self.root, self.source, self.kind, self.given_task, self.notes = root, root.resolve().name, kind, task, notes
-        self._reopen, self._latest = reopen, self
+        self._where = where
         opened, names, recorded = lru_cache(_FILES_AT_A_TIME)(Video), set[str](), dict[int, Recorded]()
         num_bytes, functions, rates = 0, dict[object, str](), list[float | None]()
         variables: list[tuple[str, CellType, object]] = []
@@ -269,13 +267,6 @@ class EpisodeDataset(RecordedDataset):
         episode = super().read_episode(number)
         return replace(episode, task=" ".join(episode.task.split()))
 
-    def as_now(self) -> EpisodeDataset:
-        fresh = self if self._reopen is None else self._reopen()
-        if fresh.names_and_tasks != self._latest.names_and_tasks:
-            self._latest = fresh
-        return self._latest
-
-    @property
-    def names_and_tasks(self) -> list[tuple[str, str | None]]:
-        """The name and the task of each episode."""
-        return [(one.name, one.task) for one in self.recorded.values()]
+    def listed_in(self) -> Iterable[Path]:
+        table = [self._where] if isinstance(self._where, Path) else []
+        return [*super().listed_in(), *table]

@@ -9,7 +9,7 @@ first shows the end of the demonstration before, and is left out, as by Arena's 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -152,6 +152,9 @@ class Hdf5Dataset(RecordedDataset):
         got = ", ".join(f"{name} {count}" for name, count in counts.items())
         require(f"{self.file}: data/{one.name}", len(set(counts.values())) < 2, "one length, above 0", got)
         return next(iter(counts.values()), 0) or super().length(number)
+
+    def listed_in(self) -> Iterable[Path]:
+        return [self.file]
 
     def place(self, episode: DatasetEpisode, camera: str) -> str:
         return f"{self.file}: data/{episode.name}/{self._folder}/{camera}"

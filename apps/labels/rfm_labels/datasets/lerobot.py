@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -136,6 +136,9 @@ class LeRobotDataset(Dataset):
         if self._hub is not None:
             self._hub.download(self.root / name for name in sizes)
 
+    def listed_in(self) -> Iterable[Path]:
+        return sorted((self.root / "meta").rglob("*"))
+
     def missing(self, numbers: Sequence[int], cameras: Sequence[str]) -> DownloadSize | None:
         sizes = self._sizes(numbers, cameras)
         return DownloadSize(len(sizes), sum(sizes.values())) if sizes else None
@@ -147,12 +150,11 @@ class LeRobotDataset(Dataset):
     def is_here(self, number: int) -> bool:
         return self._hub is None or all(file.exists() for file in self._files_of([number], self.cameras))
 
-    @property
-    def listing(self) -> Sequence[DatasetEpisode]:
+    def listed(self, number: int) -> DatasetEpisode:
         if self._hub is None:
-            return super().listing
-        entries = map(self._entry, self.numbers)
-        return [DatasetEpisode(each.index, each.where, " ".join(each.tasks[:1]), each.length, 0) for each in entries]
+            return super().listed(number)
+        entry = self._entry(number)
+        return DatasetEpisode(number, entry.where, " ".join(entry.tasks[:1]), entry.length, 0)
 
     def _files_of(self, numbers: Sequence[int], cameras: Sequence[str]) -> list[Path]:
         """The files that these episodes and cameras need, by the metadata."""

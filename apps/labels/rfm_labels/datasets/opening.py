@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -130,21 +130,26 @@ def open_to_show(source: str) -> list[Dataset]:
     source: path, Hub id or address, ``READER=FOLDER`` or ``PATTERN=FOLDER``
 
     Accepts blank and outdated tasks. In a LeRobot dataset, a row shows the nearest frame, as a player does.
+    ``Dataset.as_now`` returns the datasets as they are later.
     """
+    return [opening().follow(opening) for opening in _openings(source)]
+
+
+def _openings(source: str) -> list[Callable[[], Dataset]]:
     how, _, folder = source.partition("=")
     no_tasks, as_stored = TaskOverride(is_needed=False), AskedCorrections()
     require("", bool(folder) or not (is_reader(how) or "{episode}" in how), f"{how}=FOLDER", source)
     if is_reader(how):
-        return [open_read(how, Path(folder).resolve(), no_tasks, as_stored)]
+        return [partial(open_read, how, Path(folder).resolve(), no_tasks, as_stored)]
     if "{episode}" in how:
-        return [_by_pattern(Path(folder).resolve(), how, no_tasks, as_stored)]
+        return [partial(_by_pattern, Path(folder).resolve(), how, no_tasks, as_stored)]
     path = Path(source).resolve()
     hub = None if path.exists() else _on_hub(source)
     root = path if hub is None else hub.folder
     if (root / INFO_FILE).is_file():
         task = TaskOverride(column=TASK_COLUMN, is_needed=False)
-        return [LeRobotDataset(root, hub=hub, task=task, tolerance_s=0.5 / Info.read(root).fps)]
-    return [_open_path(each, no_tasks, as_stored) for each in hdf5_files(path) or [path]]
+        return [lambda: LeRobotDataset(root, hub=hub, task=task, tolerance_s=0.5 / Info.read(root).fps)]
+    return [partial(_open_path, each, no_tasks, as_stored) for each in hdf5_files(path) or [path]]
 
 
 def hdf5_files(folder: str | Path) -> list[Path]:
@@ -187,8 +192,7 @@ def _open_files(path: Path, task: TaskOverride, corrections: AskedCorrections) -
             notes = [f"videos in deeper folders get no labels: {first_names(deeper)}: {remedy}"]
     shown, camera, _ = _KINDS[kind]
     episodes = (Episode(name, {camera: root / name}, own) for name, own in tasks.items())
-    reopen = partial(_open_files, path, task, corrections)
-    return EpisodeDataset(episodes, root, shown, table, task, corrections, notes, reopen)
+    return EpisodeDataset(episodes, root, shown, table, task, corrections, notes)
 
 
 def _deeper_videos(folder: Path) -> list[str]:
@@ -221,8 +225,7 @@ def _by_pattern(root: Path, pattern: str, task: TaskOverride, corrections: Asked
     episodes = (Episode(name, found[name], own) for name, own in tasks.items())
     notes = _notes(table, "episodes", [name for name in found if name not in tasks])
     where = table if table.is_file() else root
-    reopen = partial(_by_pattern, root, pattern, task, corrections)
-    return EpisodeDataset(episodes, root, f"pattern {pattern}", where, task, corrections, notes, reopen)
+    return EpisodeDataset(episodes, root, f"pattern {pattern}", where, task, corrections, notes)
 
 
 def _unlisted(table: Path, kind: str, names: Collection[str]) -> list[str]:

@@ -31,7 +31,11 @@ export class DatasetTab {
   #failedAnywhere;
   #places;
   #histogram;
-  #previews = new Previews(({ episode }) => previewOf(this.#number, episode, this.#labels, this.#loading.signal));
+  #previews = new Previews(async (episode) => {
+    const told = await previewOf(this.#number, episode.episode, this.#labels, this.#loading.signal);
+    checkSame(episode, told);
+    return told;
+  });
   #loading = new AbortController();
   #table;
   #timeline;
@@ -398,10 +402,13 @@ export class DatasetTab {
     const page = this.#page;
     const numbers = this.#taken.map(({ episode }) => episode);
     const which = this.#chosen.size ? "selected" : "shown; select rows to export fewer";
-    page["chosen-told"].textContent = `${numbers.length} episodes ${which}`;
+    const told = `${numbers.length} ${numbers.length === 1 ? "episode" : "episodes"}`;
+    page["chosen-told"].textContent = `${told} ${which}`;
+    for (const option of page.use.options) option.textContent = option.textContent.replace(/( \d.*)?$/, ` ${told}`);
     page["choose-none"].disabled = !this.#chosen.size;
     page["episodes-text"].disabled = page["episodes-json"].disabled = !numbers.length;
     const dataset = this.#datasets[this.#number];
+    page.lerobot.hidden = !dataset?.kind.startsWith("LeRobot");
     const all = this.#episodes.map(({ episode }) => episode);
     this.#words = dataset ? lerobotWords(page.use.value, dataset, numbers, all) : "";
     const areFailures = numbers.length > 0 && this.#taken.every(({ never_succeeds: never }) => never);
@@ -565,7 +572,7 @@ export class DatasetTab {
     await this.#download(episode, signal);
     if (this.#told.is_on_hub) this.#table.refill(episode); // also after a download that went on without the page
     const told = await Promise.all(names.map((name) => curvesOf(this.#number, episode, name, signal)));
-    if (told[0].name !== this.#watched.name) throw new Error(`episode ${episode}: expected ${this.#watched.name}, got ${told[0].name}: reload the page`);
+    checkSame(this.#watched, { name: told[0].name, num_frames: told[0].times_s.length });
     const curves = [...curvesIn(told[0], null), ...told.slice(1).flatMap((each) => curvesIn(each, other).slice(0, 1))];
     this.#timeline.time = 0;
     this.#showCurves(curves, motionIn(told[0]), curves.length ? curves : [emptyCurve(told[0])]);
@@ -596,6 +603,7 @@ export class DatasetTab {
   /** Shows the curves of an episode, and of its robot. drawn: with one that is not named */
   #showCurves(curves, motion, drawn = curves) {
     const page = this.#page;
+    page["episode-chart"].hidden = !curves.length && motion.length > 0; // nothing would be in it
     page.motion.hidden = !motion.length;
     page["motion-legend"].replaceChildren(...new Map(motion.map((curve) => [curve.label, namedLine(curve)])).values());
     this.#timeline.show(drawn, motion);
@@ -654,6 +662,13 @@ function describe(curves) {
 /** What an episode is called in a file of outcomes: its name, if it has one, since the numbers of a folder change. */
 function idOf({ name, episode }) {
   return name ?? episode;
+}
+
+/** Throws an error if the server has another episode under this number by now. */
+function checkSame(known, { name, num_frames: numFrames }) {
+  if (known.name === name && known.num_frames === numFrames) return;
+  const [expected, got] = [[known.name, known.num_frames], [name, numFrames]].map(([own, num]) => `${own ? `${own}, ` : ""}${num} frames`);
+  throw new Error(`episode ${known.episode}: expected ${expected}, got ${got}: reload the page`);
 }
 
 /** What marks of an episode are kept under. One that was recorded again seldom has as many frames. */

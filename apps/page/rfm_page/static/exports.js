@@ -32,7 +32,6 @@ const USES = {
 /** The words for LeRobot's command line. all: the numbers of all episodes of the dataset */
 export function lerobotWords(use, dataset, numbers, all) {
   if (!numbers.length) return "# no episode is chosen";
-  if (!dataset.kind.startsWith("LeRobot")) return `# LeRobot does not read ${dataset.kind}: take episodes.txt`;
   return USES[use](dataset, numbers, all);
 }
 

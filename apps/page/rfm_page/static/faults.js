@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 // What the page says of each fault and of each thing that is missing, with the command that mends it.
 
-import { ServerError } from "./api.js";
+import { GatewayAway, ServerError } from "./api.js";
 import { quoted } from "./shell.js";
 import { datasetWords, serverOption } from "./takeaway.js";
 
@@ -119,6 +119,6 @@ export function deadLink(what) {
 /** Something failed. title: what, as a sentence without a full stop */
 export function failure(title, error, retry = null) {
   const buttons = retry ? [["Try again", retry]] : [];
-  if (error instanceof ServerError) return { title, text: "The server could not answer.", details: error.message, buttons };
+  if (error instanceof ServerError || error instanceof GatewayAway) return { title, text: "The server could not answer.", details: error.message, buttons };
   return { title, text: error.message, buttons };
 }

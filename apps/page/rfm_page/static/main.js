@@ -140,7 +140,7 @@ function failedAnywhere(error) {
 }
 
 /** Shows on the tab of videos what went wrong. */
-function failed(error, title = "That did not work", retry = null) {
+function failed(error, title, retry) {
   if (!failedAnywhere(error)) places.errors.show(failure(title, error, retry));
 }
 
@@ -355,7 +355,9 @@ async function compareAll() {
   } catch (error) {
     if (!signal.aborted) {
       error.message = error.message.replace(/\bvideo_(\d+)/g, (field, index) => all[index]?.name ?? field);
-      failed(error, "The videos could not be compared", compareAll);
+      failedAnywhere(error);
+      places.errors.show(failure("The videos could not be compared", error, compareAll)); // which stays when the server is back
+      page.errors.scrollIntoView({ block: "nearest" });
     }
   }
   comparing = null;

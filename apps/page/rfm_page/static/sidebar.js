@@ -41,6 +41,7 @@ export class Sidebar {
 
   #show(isOpen) {
     this.#button.setAttribute("aria-expanded", isOpen);
+    this.#button.textContent = isOpen ? "Hide settings" : "Settings";
     document.body.classList.toggle("folded", !isOpen);
   }
 }

@@ -35,20 +35,25 @@ export function addVerdict(host, verdict) {
   return box;
 }
 
-/** The videos, best first, each with its name, and with the mean probability of winning as a bar and a number. */
+/** The videos, best first, then those without a rank: each with the mean probability of winning, as a bar if it has a rank. */
 function rankingOf(videos, answer) {
   const list = document.createElement("ol");
   const ranked = videos.map((video, index) => ({ video, ...answer.videos[index] }));
-  for (const { video, wins, rank } of ranked.sort((one, other) => other.wins - one.wins)) {
-    const [item, bar, share] = ["li", "span", "span"].map((name) => document.createElement(name));
-    bar.className = "share";
-    share.style.width = `${100 * wins}%`;
-    share.style.background = video.colour ?? `var(--${colourName(video.place)})`;
-    bar.append(share);
-    item.append(element("span", rank ? `${rank} ${video.title}` : `${video.title} (no rank)`), bar, element("span", `mean preference ${shown(wins)}`));
+  for (const { video, wins, rank } of ranked.sort((one, other) => (one.rank ?? Infinity) - (other.rank ?? Infinity) || 0)) {
+    const [item, place] = ["li", "span"].map((name) => document.createElement(name));
+    place.className = rank ? "share" : "unranked";
+    place.append(rank ? barOf(video, wins) : "no rank");
+    item.append(element("span", rank ? `${rank} ${video.title}` : video.title), place, element("span", `mean preference ${shown(wins)}`));
     list.append(item);
   }
   return list;
+}
+
+function barOf(video, share) {
+  const bar = document.createElement("span");
+  bar.style.width = `${100 * share}%`;
+  bar.style.background = video.colour ?? `var(--${colourName(video.place)})`;
+  return bar;
 }
 
 /** What the model answers about each pair, in both orders. */
