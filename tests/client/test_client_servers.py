@@ -256,12 +256,16 @@ def test_a_call_waits_for_its_only_server_to_be_back() -> None:
     assert (only.asked["infer"], only.asked["while down"]) == (32, 0)
 
 
-def test_a_server_that_comes_back_with_another_checkpoint_is_reported(caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize(("num_ends", "lull_s"), [(1, 60.0), (0, 0.0)], ids=["after a failure", "after a lull"])
+def test_a_server_that_comes_back_with_another_checkpoint_is_reported(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, num_ends: int, lull_s: float
+) -> None:
+    monkeypatch.setattr("rfm_client.transport.servers.LULL_S", lull_s)
     stand = Stand()
     with RewardClient("", transports=[stand]) as client:
         assert client.model_info().weights_digest == "a" * 16
         for digest, told in (("a" * 16, 0), ("b" * 16, 1), ("b" * 16, 1)):
-            stand.num_ends, stand.weights_digest = 1, digest
+            stand.num_ends, stand.weights_digest = num_ends, digest
             client.progress(SEEN)
             assert caplog.text.count(f"another checkpoint, rfm (weights {'b' * 16}) instead of rfm") == told
         assert client.model_info().weights_digest == "b" * 16

@@ -317,6 +317,18 @@ def test_an_episode_is_scored_by_one_checkpoint_and_the_next_one_as_the_served_c
     assert [shape[1] for shape in shelf.shapes] == [4, 4, 4, 4, 8, 8]  # the fourth answer is by another checkpoint
 
 
+def test_an_episode_may_name_the_only_checkpoint_that_may_score_it() -> None:
+    shelf, frames = Shelf(SHORT, LONG, after=1, has_encoder=False), video(125, 2)
+    with RewardClient("", transports=[shelf]) as client:
+        episode = client.episode(TASK, env=3, weights_digest="weights-of-v1")
+        assert episode.add(frames[0]).step == 0
+        for _ in range(2):
+            episode.reset()
+            got = r"rfm_frames \(weights weights-of-v2\)"
+            with pytest.raises(InferenceFailedError, match=rf"^envs\[3\]: expected .* weights-of-v1, got {got}"):
+                episode.add(frames[1])
+
+
 def test_frames_are_resized_as_the_served_checkpoint_reads_them_by_now() -> None:
     """Kept frames have the size of the episode's first."""
     small = replace(SHORT, frame_size=FrameSize("exact", (8, 8)))

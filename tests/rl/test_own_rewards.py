@@ -160,7 +160,11 @@ class Pleased(CodeReader):
         return {"progress": 1.0, "success": 1.0}
 
 
-def test_the_callback_of_the_guide_logs_rewards_progress_and_success(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_first", [True, False])
+def test_the_callback_of_the_guide_logs_each_rollout_once_before_and_after_others(
+    tmp_path: Path, is_first: bool
+) -> None:
+    """EvalCallback writes the log within a rollout."""
     guide = (ROOT / "docs" / "guides" / "reward_an_rl_loop.md").read_text()
     (code,) = (each for each in re.findall(r"^```python\n(.*?)^```", guide, re.M | re.S) if "class LogRewards" in each)
     shown: dict[str, Any] = {}
@@ -168,9 +172,15 @@ def test_the_callback_of_the_guide_logs_rewards_progress_and_success(tmp_path: P
     with Recorder(server=Pleased()) as client:
         model = PPO("MultiInputPolicy", single(client, Reach()), n_steps=4, batch_size=4, device="cpu")
         model.set_logger(configure(str(tmp_path), ["json"]))
-        model.learn(4, shown["LogRewards"]()).logger.close()
-    logged = json.loads((tmp_path / "progress.json").read_text())
-    assert [logged[f"reward_model/{key}"] for key in ("reward", "progress", "success")] == [1, 1, 1]
+        callbacks = [
+            shown["LogRewards"](),
+            EvalCallback(Monitor(single(client, Reach())), n_eval_episodes=1, eval_freq=2),
+        ]
+        model.learn(8, callbacks if is_first else callbacks[::-1]).logger.close()
+    rows = [json.loads(line) for line in (tmp_path / "progress.json").read_text().splitlines()]
+    logged = [row for row in rows if "reward_model/progress" in row]
+    assert [row["time/total_timesteps"] for row in logged] == [4, 8]
+    assert all([row[f"reward_model/{key}"] for key in ("reward", "progress", "success")] == [1, 1, 1] for row in logged)
 
 
 @pytest.mark.parametrize(

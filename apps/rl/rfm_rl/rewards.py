@@ -55,8 +55,8 @@ class RewardOptions(FrameOptions):
         single camera without a name
     score: what rewards are made from: ``progress``, or ``remaining_s``: minus the remaining seconds, in place of
         progress in each mode, so that a step pays the seconds that it gains
-    sampling, fuse, orient, channels, resize: as in ``rfm_client.episodes.FrameOptions``; rendered frames are
-        changed alike
+    sampling, fuse, orient, channels, resize, weights_digest: as in ``rfm_client.episodes.FrameOptions``; rendered
+        frames are changed alike
     max_frames: ``frames`` in EpisodeOptions: the rule's frame count
     blocking: True: a step waits for its score; False: only the reset and an episode's last step wait
     max_pending: how many of an environment's steps may have open requests when not blocking

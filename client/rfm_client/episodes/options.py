@@ -74,6 +74,7 @@ class StepKeywords(TypedDict, total=False):
     orient: Orientation | Mapping[str, Orientation]
     channels: ChannelOrder | Mapping[str, ChannelOrder]
     resize: bool
+    weights_digest: str | None
     success: SuccessRule
     timeout_s: float | None
     score: StepValue
@@ -91,6 +92,8 @@ class FrameOptions:
     channels: colour order in the given frames, ``rgb`` or ``bgr``: one for all cameras, or a dict by camera
     resize: True: shrink frames to the checkpoint's size before they are kept and sent (needs Pillow); ReWiND's scores
         then differ slightly
+    weights_digest: score only with the checkpoint whose ``client.model_info(frames=True).weights_digest`` this is, else
+        a step raises InferenceFailedError; None: with any
     score: the score that rewards are made from, ``progress`` or ``remaining_s``; a step raises ValueError if the
         checkpoint does not predict it
     """
@@ -101,6 +104,7 @@ class FrameOptions:
     orient: Orientation | Mapping[str, Orientation] = "none"
     channels: ChannelOrder | Mapping[str, ChannelOrder] = "rgb"
     resize: bool = False
+    weights_digest: str | None = None
     score: StepValue = "progress"
 
     def __post_init__(self) -> None:

@@ -80,7 +80,7 @@ class StepScorer:
     async def scores(self, asked: Sequence[Asked], call: Call) -> list[StepScore]:
         """Return a score for each step, from as few requests as possible. Raises RewardError, ValueError.
 
-        InferenceFailedError: another checkpoint scored an episode's earlier steps
+        InferenceFailedError: another checkpoint scored an episode's earlier steps, or is not the one that it names
         """
         info = await self.model_info(call)
         shown = [steps.windows(step, info) for steps, step in asked]
@@ -90,8 +90,9 @@ class StepScorer:
             steps.score(step, prefix, list(islice(outcomes, len(windows))), ms)
             for (steps, step), (prefix, windows) in zip(asked, shown, strict=True)
         ]
+        info = await self.model_info(call)  # another one if the checkpoint changed during the call
         for steps, _ in asked:
-            steps.check_checkpoint(self._scorer.changes)
+            steps.check_checkpoint(info, self._scorer.changes)
         return scores
 
     async def in_turn(

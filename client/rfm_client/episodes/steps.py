@@ -141,15 +141,18 @@ class Steps:
         }
         return StepScore(float(fused.progress[-1]), float(fused.success[-1]), succeeded, step, ms, more)
 
-    def check_checkpoint(self, changes: Sequence[str]) -> None:
-        """Raise InferenceFailedError if the checkpoint has changed since the episode's first score.
+    def check_checkpoint(self, info: ModelInfo, changes: Sequence[str]) -> None:
+        """Raise InferenceFailedError if the checkpoint is not the one in the options, or changed after the first score.
 
         changes: a line for each change that the client has seen
         """
+        where, pinned = self._where or "episode", self.options.weights_digest
+        if pinned not in (None, info.weights_digest):
+            got = f"{info.source or info.name} (weights {info.weights_digest})"
+            raise InferenceFailedError(f"{where}: expected a checkpoint with weights {pinned}, got {got}")
         if self._num_changes is None:
             self._num_changes = len(changes)
         if self._num_changes != len(changes):
-            where = self._where or "episode"
             expected = "the checkpoint that scored its first steps"
             raise InferenceFailedError(f"{where}: expected {expected}, got {changes[-1]}: reset the episode")
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
+import math
 import random
 import time
 from collections.abc import Awaitable, Callable, Collection, Sequence
@@ -50,6 +51,7 @@ LONGEST_REST_S = 30.0  # longest pause before probing a server that reports read
 RESTART_S = 15.0  # longer than `rfm serve` takes to notice that a process ended and to restart Triton
 SPREAD_S = 1.0  # spreads retries, so that a request that ends its process again takes few others with it
 PROBE_TIMEOUT_S = 2.0
+LULL_S = 1.0  # no server restarts faster
 _POLL_S = 0.2
 
 logger = logging.getLogger("rfm_client")
@@ -59,6 +61,7 @@ class KnownServer:
     """One of several servers: transport, load and failures.
 
     failures: how often the server was left out since the last success
+    answered_at_s: when it last answered (monotonic clock)
     lost_at_s: when the first request that is retried failed (monotonic clock); None: none since the last success
     comeback: ends when the server reports ready again; None: never left out
     """
@@ -68,6 +71,7 @@ class KnownServer:
         self.outstanding = 0
         self.last_request = 0
         self.failures = 0
+        self.answered_at_s = math.inf
         self.lost_at_s: float | None = None
         self.comeback: asyncio.Task[None] | None = None
 
@@ -111,7 +115,7 @@ class Servers:
         self._servers = [KnownServer(transport) for transport in transports]
         self._retry = retry
         self._is_closed = False
-        self.returns = 0  # how often a server answered that had failed before
+        self.returns = 0  # how often a server answered that may have restarted: after a failure or a lull
         self._answered: set[str] = set()  # models that any server has served
         self._moments = itertools.count(1)
 
@@ -216,6 +220,7 @@ class Servers:
         for attempt in itertools.count():
             server = self._best(refusals, first)
             left_s = deadline.remaining_s()
+            asked_at_s = time.monotonic()
             try:
                 answer = await self._ask(server, model, request, left_s)
             except DeadlineExceededError as error:  # the server may hang
@@ -255,8 +260,8 @@ class Servers:
                 if deadline.ends_within(0):  # the pause took longer than planned
                     raise
             else:
-                self.returns += server.failures > 0
-                server.failures = 0
+                self.returns += server.failures > 0 or asked_at_s - server.answered_at_s > LULL_S
+                server.failures, server.answered_at_s = 0, time.monotonic()
                 if server.lost_at_s is not None:
                     lost_s = time.monotonic() - server.lost_at_s
                     logger.warning("%s: answers again after %.1f s", server.transport.url, lost_s)
