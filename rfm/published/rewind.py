@@ -82,15 +82,15 @@ def _loaded(
     of_encoders = []
     for kind, source, option, weights in zip(("image", "text"), sources, named, own, strict=True):
         given = f"--{kind}-encoder" if option else UPSTREAM_DEFAULT
-        whose = "its weights are the checkpoint's" if weights else "only its width agrees"
+        whose = "its settings alone: the weights are the checkpoint's" if weights else "only its width agrees"
         of_encoders.append(Assumption(f"{kind}_encoder", source_name(source), f"{given}; {whose}"))
     load = partial(_encoders, checkpoint, sources)
-    return Loaded(checkpoint, (*assumed, *of_encoders), lambda _checkpoint: _encoder_notes(sources), load)
+    return Loaded(checkpoint, (*assumed, *of_encoders), lambda _checkpoint: _encoder_notes(sources, own), load)
 
 
-def _encoder_notes(sources: tuple[str, str]) -> list[str]:
+def _encoder_notes(sources: tuple[str, str], own: tuple[object, object]) -> list[str]:
     """Return one line per encoder that differs from upstream's with the same width. Raises CheckpointError."""
-    with _having_encoders(sources):
+    with _having_encoders(sources, own):
         found = image_differences(sources[0]), text_differences(sources[1])
     return [
         f"{source}: differs from upstream's {known} in {'; '.join(lines)}: scores are right only if the run's "
@@ -119,7 +119,7 @@ def _differences(known: Mapping[str, Any], *files: Any) -> list[str]:
 
 def _encoders(checkpoint: RewindCheckpoint, sources: tuple[str, str]) -> Encoders:
     """Load a checkpoint's encoders. Raises CheckpointError if they are missing or do not fit the network."""
-    with _having_encoders(sources):
+    with _having_encoders(sources, (checkpoint.image_encoder, checkpoint.text_encoder)):
         encoders = Encoders.from_pretrained(
             *sources, image_weights=checkpoint.image_encoder or None, text_weights=checkpoint.text_encoder or None
         )
@@ -129,14 +129,15 @@ def _encoders(checkpoint: RewindCheckpoint, sources: tuple[str, str]) -> Encoder
 
 
 @contextmanager
-def _having_encoders(sources: tuple[str, str]) -> Iterator[None]:
+def _having_encoders(sources: tuple[str, str], own: tuple[object, object]) -> Iterator[None]:
     try:
         yield
     except misfits(ImportError, OSError, CheckpointError) as error:
         absent = [source for source in sources if not Path(source).is_dir()]
         here = f"; there is no folder {' nor '.join(absent)} either" if absent else ""
         hint = f"name local folders with --image-encoder and --text-encoder{here}"
-        raise CheckpointError(f"encoders {' and '.join(sources)}: {cut(str(error))} ({hint})") from error
+        what = f"encoders {' and '.join(sources)}" + ", whose settings the checkpoint's encoder weights need" * any(map(bool, own))
+        raise CheckpointError(f"{what}: {cut(str(error))} ({hint})") from error
 
 
 def reads(folder: Path) -> bool:

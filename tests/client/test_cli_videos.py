@@ -30,9 +30,9 @@ from rfm_client import (
 )
 from rfm_client.cli import pictures
 from rfm_client.cli.comparing import LEGEND, Comparison, compare
-from rfm_client.cli.options import VideoOptions
+from rfm_client.cli.options import PrefixOptions, VideoOptions
 from rfm_client.cli.pictures import Panel, plot
-from rfm_client.cli.scoring import Source
+from rfm_client.cli.scoring import Source, rule
 from rfm_client.command_line import ExitCode
 from servers import Served
 from shelves import Shelf
@@ -192,13 +192,24 @@ def test_compare_refuses_the_answers_of_two_versions(tmp_path: Path, video: Path
         compare(client, [str(video), str(tmp_path / "small.npy")], VideoOptions(task=TASK))
 
 
-def test_compare_says_what_to_do_without_a_preference_head(video: Path) -> None:
-    told = "expected a checkpoint with a preference head, got rfm_frames; compare final progress with rfm-client score"
-    with (
-        RewardClient("", transports=[Shelf(has_preference=False)]) as client,
-        pytest.raises(InvalidSampleError, match=f"^compare: {told}$"),
-    ):
-        compare(client, [str(video)] * 2, VideoOptions(task=TASK))
+@pytest.mark.parametrize(
+    ("gives", "remedy"),
+    [
+        ({}, "compare final progress with rfm-client score"),
+        ({"has_progress": False}, "compare remaining seconds at the last frame with rfm-client score"),
+        ({"needs_whole_episode": True}, "compare log_prob at the last frame (rfm-client score --json)"),
+    ],
+)
+def test_compare_says_what_to_do_without_a_preference_head(
+    video: Path, monkeypatch: pytest.MonkeyPatch, gives: dict[str, bool], remedy: str
+) -> None:
+    told = "compare: expected a checkpoint with a preference head, got rfm_frames; "
+    with RewardClient("", transports=[Shelf(has_preference=False)]) as client:
+        info = replace(client.model_info(frames=True), **gives)
+        monkeypatch.setattr(client, "model_info", lambda frames: info)
+        with pytest.raises(InvalidSampleError, match=f"^{re.escape(told + remedy)}$"):
+            compare(client, [str(video)] * 2, VideoOptions(task=TASK))
+    assert ("log_prob" in rule([info], PrefixOptions())) == info.needs_whole_episode
 
 
 def test_a_plot_has_a_strip_for_each_video_and_is_drawn_without_scores_too(tmp_path: Path) -> None:

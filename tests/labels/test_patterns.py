@@ -95,7 +95,8 @@ def test_the_pattern_that_a_refusal_prints_opens_the_folder(
     write(tmp_path, [*files, ".trash/0/videos/head.mp4"])
     with pytest.raises(DatasetError) as refused:
         open_dataset(tmp_path, task=TASK)
-    (printed,) = re.findall(r"--videos '(.*?)'", str(refused.value))
+    *each, printed = re.findall(r"--videos '(.*?)'", str(refused.value))
+    assert each == ["{episode}.mp4"] * (files[0].endswith("mp4") and pattern != "{episode}.mp4")
     assert (printed, files[0].rpartition("/")[0] in str(refused.value)) == (pattern, True)
     dataset = open_dataset(tmp_path, task=TASK, videos=printed)
     assert [each.name for each in dataset.episodes] == episodes

@@ -112,7 +112,7 @@ def score(
         outcomes = scoring.SourceScorer(client, video, prefix, recording).score_all(videos, tell)
     infos = [outcome.info for outcome in shown]
     if output.prints_tables and shown:
-        print("\n" + wrapped(prefix.rule(scoring.checkpoint_names(infos)), "  ", "  "))
+        print("\n" + wrapped(scoring.rule(infos, prefix), "  ", "  "))
     scoring.report_warnings(infos)
     output.write_json(documents.score_document(server, video, prefix, outcomes))
     title = scoring.heading(video.task, infos, output.caption)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 from rfm_client.cli.options import VideoOptions
-from rfm_client.cli.scoring import Source, checkpoint_name, report_warnings
+from rfm_client.cli.scoring import COMPARE_LOG_PROB, Source, checkpoint_name, report_warnings
 from rfm_client.cli.show import at_end, number, table, title_at_end, wrapped
 from rfm_client.client import RewardClient
 from rfm_client.contract.description import ModelInfo
@@ -66,7 +66,8 @@ def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> 
     trajectories = [_of_one_task(sources[0], source) for source in sources]
     info = client.model_info(frames=trajectories[0].frames is not None)
     if not info.has_preference:
-        remedy = "compare final progress with rfm-client score"
+        number_at_end = "final progress" if info.has_progress else "remaining seconds at the last frame"
+        remedy = COMPARE_LOG_PROB if info.needs_whole_episode else f"compare {number_at_end} with rfm-client score"
         raise InvalidSampleError.at("compare", "a checkpoint with a preference head", checkpoint_name(info), remedy)
     limits = info.max_frames if video.subsample else None, info.frame_size if video.resize else None
     fits = [fitted(ProgressSample(trajectory), *limits) for trajectory in trajectories]  # once, not for every pair

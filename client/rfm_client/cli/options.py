@@ -242,13 +242,6 @@ class PrefixOptions(Settings):
         except InvalidValueError as error:
             raise ConfigError.like(error) from None
 
-    def rule(self, checkpoints: str) -> str:
-        """Return a line for the user: which checkpoints scored, and which frames decide a frame's score."""
-        if self.sampling is not None:
-            frames = f", {self.frames} frames" if self.frames else ""
-            return f"{checkpoints} scored each frame on its prefix: {self.sampling}{frames}."
-        return f"{checkpoints} scored these frames in one pass; labels and the page score each prefix (--sampling)."
-
 
 @dataclass(frozen=True)
 class JsonOutput(Settings):

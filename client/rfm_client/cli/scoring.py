@@ -38,6 +38,7 @@ from rfm_client.scoring.samples import CallOptions
 
 WORKERS = 8  # videos in memory at a time
 PROBE_S = 2.0  # timeout for checking that a server is alive
+COMPARE_LOG_PROB = "compare log_prob at the last frame (rfm-client score --json)"
 NOT_ASKED = "not asked, since no server answers any more"
 
 Times = npt.NDArray[np.float64]
@@ -227,6 +228,17 @@ def heading(task: str, infos: Iterable[ModelInfo], caption: str | None = None) -
 def checkpoint_names(infos: Iterable[ModelInfo]) -> str:
     """Return the names of these checkpoints, each once."""
     return ", ".join(dict.fromkeys(map(checkpoint_name, infos)))
+
+
+def rule(infos: Sequence[ModelInfo], prefix: PrefixOptions) -> str:
+    """Return a line for the user: which checkpoints scored, and which frames decide a frame's score."""
+    names = checkpoint_names(infos)
+    if any(info.needs_whole_episode for info in infos):
+        return f"{names} scored each video as a whole episode. Do not compare videos by progress: {COMPARE_LOG_PROB}."
+    if prefix.sampling is None:
+        return f"{names} scored these frames in one pass; labels and the page score each prefix (--sampling)."
+    frames = f", {prefix.frames} frames" if prefix.frames else ""
+    return f"{names} scored each frame on its prefix: {prefix.sampling}{frames}."
 
 
 def checkpoint_name(info: ModelInfo) -> str:

@@ -302,5 +302,9 @@ def _unread(path: Path) -> str | None:
     deeper = next((name for name in files_below(path) if Path(name).suffix.lower() in kinds), None)
     if deeper is None:
         return None
-    remedy = f"name the episode and the camera in their paths, perhaps --videos '{suggested_pattern(path, deeper)}'"
-    return f"{kinds[Path(deeper).suffix.lower()]} in deeper folders ({deeper}): {remedy}; or {_READER}"
+    suffix, pattern = Path(deeper).suffix, suggested_pattern(path, deeper)
+    remedy = f"name the episode and the camera in their paths, perhaps --videos '{pattern}'"
+    if suffix.lower() in _VIDEO_SUFFIXES:  # folders may be cameras, tasks, outcomes
+        each = f"{{episode}}{suffix}"
+        remedy = f"--videos '{each}' if each is an episode" + f"; else {remedy}" * (pattern != each)
+    return f"{kinds[suffix.lower()]} in deeper folders ({deeper}): {remedy}; or {_READER}"
