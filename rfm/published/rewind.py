@@ -136,7 +136,8 @@ def _having_encoders(sources: tuple[str, str], own: tuple[object, object]) -> It
         absent = [source for source in sources if not Path(source).is_dir()]
         here = f"; there is no folder {' nor '.join(absent)} either" if absent else ""
         hint = f"name local folders with --image-encoder and --text-encoder{here}"
-        what = f"encoders {' and '.join(sources)}" + ", whose settings the checkpoint's encoder weights need" * any(map(bool, own))
+        need = ", whose settings the checkpoint's encoder weights need" if any(own) else ""
+        what = f"encoders {' and '.join(sources)}{need}"
         raise CheckpointError(f"{what}: {cut(str(error))} ({hint})") from error
 
 
