@@ -121,7 +121,9 @@ def test_an_export_keeps_assumptions_and_versions_and_nothing_reads_them(tmp_pat
     rfm_export.export(FRAMES.checkpoint, tmp_path, settings, say=said.append, begin=begun.append)
     assert [step.partition(" ")[0] for step in begun] == ["reading", "writing", "comparing"]
     checkpoint = tmp_path / "rfm" / "1" / "checkpoint"
-    whose = {name: f"--{name}-encoder; its settings alone: the weights are the checkpoint's" for name in ("image", "text")}
+    whose = {
+        name: f"--{name}-encoder; its settings alone: the weights are the checkpoint's" for name in ("image", "text")
+    }
     assert json.loads((checkpoint / "provenance.json").read_text()) == {
         "assumed": [
             {"name": f"{name}_encoder", "value": f"encoders/{name}_encoder", "source": source}
