@@ -225,9 +225,12 @@ def sample(
         samples = synthetic.samples(client)
         outcomes = client.evaluate(samples, return_errors=True)
     failures = [outcome for outcome in outcomes if isinstance(outcome, RewardError)]
+    told: dict[str, list[int]] = {}
     for index, outcome in enumerate(outcomes):
-        if isinstance(outcome, RewardError):
-            report(f"samples[{index}]: {with_remedy(outcome, '')}")  # not the videos' remedy: --num-frames decides
+        if isinstance(outcome, RewardError):  # without the videos' remedy: --num-frames decides
+            told.setdefault(str(with_remedy(outcome, "")), []).append(index)
+    for message, (first, *others) in told.items():
+        report(f"samples[{first}]{f' and {len(others)} more' if others else ''}: {message}")
     rows = [(f"{index}", outcome) for index, outcome in enumerate(outcomes) if not isinstance(outcome, RewardError)]
     if output.prints_tables and rows:
         of = "embeddings" if samples[0].trajectories[0].frames is None else "frames"
