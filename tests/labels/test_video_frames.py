@@ -151,6 +151,7 @@ def test_a_truncated_video_is_refused_or_read_as_far_as_its_whole_frames_go(
     write(file, noise())
     shown = read_video(file)
     assert len(shown) == len(labelled(file)) == NUM_FRAMES
+    assert len(read_video(file, fps=FPS / 2)) == NUM_FRAMES // 2
     whole = file.read_bytes()
     file.write_bytes(whole[: int(len(whole) * 0.31)])
     for read in (read_video, labelled):

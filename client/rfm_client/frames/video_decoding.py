@@ -76,7 +76,7 @@ class Packets:
     times_s: float64 [N], sorted time stamps; packets without a time stamp are left out
     num_hidden: packets that are not shown, as in videos cut without encoding
     tick_s: time stamp unit, in seconds
-    fps: average frames per second; 0: the file does not give it
+    fps: average frames per second, the file's or from its time stamps; 0: unknown
     """
 
     count: int
@@ -124,7 +124,10 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
                 times_s.append(packet.pts * unit.numerator / unit.denominator)  # rounded as the fraction is
             count += 1
         tick_s, fps = float(stream.time_base), float(stream.average_rate or 0)
-    return Packets(count, np.sort(np.array(times_s, np.float64)), num_hidden, tick_s, fps)
+    times = np.sort(np.array(times_s, np.float64))
+    if not fps and len(times) > 1 and times[-1] > times[0]:  # Ogg states no average
+        fps = (len(times) - 1) / float(times[-1] - times[0])
+    return Packets(count, times, num_hidden, tick_s, fps)
 
 
 def _check_kind(file: BinaryIO) -> None:
