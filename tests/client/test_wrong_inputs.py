@@ -95,7 +95,7 @@ USAGE = {
     f"rfm-client gateway --triton {NOBODY} --metrics-url nope": bad(
         "--metrics-url", "expected http://host:port/metrics, got 'nope'"
     ),
-    f"rfm-client gateway --triton {NOBODY} --dataset nope": bad("--dataset", f"nope: {DATASET} none"),
+    f"rfm-client gateway --triton {NOBODY} --dataset nope": bad("--dataset", f"nope: {DATASET} none: there is no FOLDER/nope"),
     "rfm-client label dataset --override-task": "Invalid value: --override-task needs --task",
     "rfm score a.mp4": "No such command 'score': that is `rfm-client score`",
     "rfm try a.mp4 --task N/A": bad("--task", "expected a sentence, got 'N/A'"),
@@ -127,7 +127,7 @@ FAILURES = {
         "localhost's addresses, IPv6 and IPv4, gRPC reports the fault of one alone",
     ),
     "rfm-client evaluate nope": (1, "nope: expected a labelled dataset, got no file or folder of this name"),
-    "rfm-client label nope": (1, f"nope: {DATASET} none"),
+    "rfm-client label nope": (1, f"nope: {DATASET} none: there is no FOLDER/nope"),
     "rfm-client label file.txt": (1, f"file.txt: {DATASET} another file"),
     "rfm serve repository --http-port 0": (1, "--http-port: expected at least 1, got 0"),
     "rfm serve repository --grpc-key key.pem": (1, "--grpc-key needs --grpc-certificate"),
@@ -141,7 +141,7 @@ FAILURES = {
     ),
     "rfm serve repository --gateway-port FREE_PORT --gateway-dataset nope": (
         1,
-        f"--gateway-dataset: nope: {DATASET} none",
+        f"--gateway-dataset: nope: {DATASET} none: there is no FOLDER/nope",
     ),
     "rfm serve repository --config mistake.yaml": (
         *(1, "mistake.yaml: expected a YAML file, got a mistake in line 2 "),
@@ -205,7 +205,7 @@ def answer(command: str) -> tuple[int, str]:
     """Return the exit code and the last line of standard error."""
     program, *words = shlex.split(command.replace("FREE_PORT", str(Endpoints.free().http_port)))
     done = (rfm if program == "rfm" else rfm_client)(*words)
-    return done.exit_code, done.stderr.splitlines()[-1]
+    return done.exit_code, done.stderr.splitlines()[-1].replace(str(Path.cwd()), "FOLDER")
 
 
 @pytest.mark.parametrize(("command", "message"), USAGE.items(), ids=USAGE)

@@ -116,7 +116,7 @@ def _on_hub(source: str | Path) -> HubFiles:
     """Return the files of a LeRobot dataset on the Hub. Raises DatasetError."""
     match = _HUB_ID.fullmatch(str(source))
     if match is None:
-        raise DatasetError.at(source, _LAYOUTS, "none")
+        raise DatasetError.at(source, _LAYOUTS, f"none: there is no {Path(source).absolute()}")
     hub = HubFiles(match[1], match[2] or match[3])
     if not (hub.folder / INFO_FILE).is_file():
         got = (hub.folder.is_dir() and _unread(hub.folder)) or "none: hf download it, and name its folder"
