@@ -95,7 +95,9 @@ USAGE = {
     f"rfm-client gateway --triton {NOBODY} --metrics-url nope": bad(
         "--metrics-url", "expected http://host:port/metrics, got 'nope'"
     ),
-    f"rfm-client gateway --triton {NOBODY} --dataset nope": bad("--dataset", f"nope: {DATASET} none: there is no FOLDER/nope"),
+    f"rfm-client gateway --triton {NOBODY} --dataset nope": bad(
+        "--dataset", f"nope: {DATASET} none: there is no FOLDER/nope"
+    ),
     "rfm-client label dataset --override-task": "Invalid value: --override-task needs --task",
     "rfm score a.mp4": "No such command 'score': that is `rfm-client score`",
     "rfm try a.mp4 --task N/A": bad("--task", "expected a sentence, got 'N/A'"),
