@@ -541,7 +541,7 @@ def test_the_figure_fits_a_column_of_a_paper_and_is_light(page: Page) -> None:
 MODULES = """
 const [named, done] = arguments;
 Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts"].map((name) => import(`/viewer/${name}.js`))).then(
-  ([{ cut }, { serverOption, datasetWords }, { Curve }, { svgFigure }, { lerobotWords }, { sentenceOf }]) => {
+  ([{ cut }, { commands, serverOption, datasetWords }, { Curve }, { svgFigure }, { lerobotWords }, { sentenceOf }]) => {
     const settings = { task: "lift", model: "m", rule: "all", fps: 1 };
     const curve = new Curve({ title: "a.mp4", id: 1 }, settings);
     curve.take("video", { num_frames: 7, times_s: null });
@@ -561,7 +561,10 @@ Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts"].map(
     const answer = { videos: [1, null, null, 4].map((rank) => ({ rank })), pairs: [{ verdict: null }, { verdict: "first" }] };
     const circle = { videos: [{ rank: null }, { rank: null }, { rank: null }], pairs: [{ verdict: "first" }] };
     const sentences = [answer, circle].map((each) => sentenceOf({ videos: [..."abcd"].map((title) => ({ title })), answer: each }));
-    done([figure, names, servers, datasets, words, sentences]);
+    const origin = { dataset: "rec", kind: "videos", episode: 3, camera: "top", task: "lift", fps: 5 };
+    const given = { ...settings, rule: "rint", fps: 5, orient: "none", channels: "rgb" };
+    const lines = commands("grpc://triton:8001", [4, 8].map((sampledFrames) => ({ video: { origin }, ...given, sampledFrames })), []);
+    done([figure, names, servers, datasets, words, sentences, lines]);
   });
 """
 
@@ -569,7 +572,9 @@ Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts"].map(
 def test_modules_cut_names_name_a_reachable_triton_and_lead_a_line_over_skipped_frames(page: Page) -> None:
     """Of seven frames the model skips three, and the score of one is missing."""
     dataset = "Ann's set; touch \n$(touch x)"
-    markup, names, servers, datasets, words, sentences = page.browser.driver.execute_async_script(MODULES, dataset)
+    markup, names, servers, datasets, words, sentences, lines = page.browser.driver.execute_async_script(
+        MODULES, dataset
+    )
     assert names == ["rollout_seed…100k.mp4", "success.mp4"]
     key = ["--api-key-file", "KEY_FILE"]
     assert servers == [["--url", "grpc://127.0.0.1:8001"], [], ["--url", "grpc://triton:8001", *key]]
@@ -580,6 +585,8 @@ def test_modules_cut_names_name_a_reachable_triton_and_lead_a_line_over_skipped_
         "a does the task best, but b and c have no rank: some answers depend on which video comes first.",
         "No best video: several win equally often.",
     ]
+    folders = [re.findall(r"--frames (\d) --output (\S+)", line) for line in lines.splitlines()]
+    assert folders == [[("4", "rec_episode_3")], [("8", "rec_episode_3_2")]]
     svg = ElementTree.fromstring(markup)
     assert [len(line.attrib["points"].split()) for line in svg.iter(f"{SVG}polyline")] == [2, 1]
     assert "\N{MINUS SIGN}0.5" in texts(svg)  # the axis reaches the score below 0

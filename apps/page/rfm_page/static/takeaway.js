@@ -70,7 +70,7 @@ export function json(url, curves, verdicts) {
  * cameras of an episode of a dataset. A comment stands for what no command can do.
  */
 export function commands(url, curves, verdicts) {
-  const ofEpisodes = grouped(curves.filter(({ video }) => video.origin?.dataset), askedOfEpisode).map((group) => labelLine(group, url));
+  const ofEpisodes = grouped(curves.filter(({ video }) => video.origin?.dataset), askedOfEpisode).map((group, index, all) => labelLine(group, url, timesBefore(group, all.slice(0, index))));
   const groups = grouped(curves.filter(({ video }) => !video.origin?.dataset), asked);
   const scores = groups.map((group, index) => {
     const [{ rule, sampledFrames }] = group;
@@ -79,6 +79,11 @@ export function commands(url, curves, verdicts) {
   });
   const comparisons = verdicts.map((verdict) => line("compare", verdict.videos, verdict, url, []));
   return [...scores, ...ofEpisodes, ...comparisons].join("\n");
+}
+
+/** How many groups are of the same episode as this one. */
+function timesBefore([{ video: { origin } }], groups) {
+  return groups.filter(([{ video }]) => video.origin.dataset === origin.dataset && video.origin.episode === origin.episode).length;
 }
 
 function grouped(curves, askedOf) {
@@ -100,8 +105,8 @@ function sampling(rule, frames) {
   return ["--sampling", rule, ...(frames === null ? [] : ["--frames", frames])];
 }
 
-/** The command that labels an episode of a dataset as the page has scored it. */
-function labelLine(group, url) {
+/** The command that labels an episode of a dataset as the page has scored it. before: such commands of the same episode */
+function labelLine(group, url, before) {
   const [{ video: { origin }, task, model, rule, sampledFrames, fps, resize }] = group;
   const about = `episode ${origin.episode} of ${origin.dataset}`;
   if (fps !== origin.fps) return commented(`${about}: a command scores all of its frames, ${origin.fps} a second, not ${fps}`);
@@ -110,7 +115,7 @@ function labelLine(group, url) {
   const options = ["--episodes", origin.episode, "--cameras", cameras.join(","), ...corrections, ...sampling(rule, sampledFrames)];
   const given = task === origin.task ? [] : ["--task", task, "--override-task"];
   const words = ["rfm-client", "label", ...datasetWords({ name: origin.dataset, kind: origin.kind }), ...serverOption(url), "--model", model, ...given, ...options];
-  const target = ["--output", `${origin.dataset.replace("/", "_")}_episode_${origin.episode}`, "--format", "progress"];
+  const target = ["--output", `${origin.dataset.replace("/", "_")}_episode_${origin.episode}${before ? `_${before + 1}` : ""}`, "--format", "progress"];
   return [...words, ...(resize ? ["--resize"] : []), ...target].map(quoted).join(" ");
 }
 
