@@ -165,9 +165,9 @@ def test_every_command_line_runs(demo_server: Endpoints, folder: Path, command: 
         return  # it ends with a signal; tests/gateway runs it
     for placeholder, served in SERVED_AS.items():
         command = command.replace(placeholder, served)
-    if command.startswith("rfm-client evaluate"):
+    if command.startswith("rfm-client evaluate") or " --remove " in command:
         dataset = command.split()[2]
-        labels = re.findall(rf"{dataset}/(\w+)_progress\.parquet", command) or ["rfm"]
+        labels = re.findall(rf"(?:{dataset}/|--remove )(\w+?)(?:_progress\.parquet|$)", command) or ["rfm"]
         for name in labels:
             assert rfm_client("label", dataset, "--name", name, "--url", demo_server.grpc_url).exit_code == 0
     if not re.search(r"[|&;$<>]", command):
