@@ -206,6 +206,11 @@ def test_the_pointer_the_keys_and_the_button_move_the_videos_and_the_numbers(pag
     told = page.browser["time"].get_attribute("aria-valuetext")
     assert told.startswith("1.10")
     assert f"progress {expected[0]:.3f}, success {expected[2]:.3f}" in told
+    right = over.rect["x"] + width
+    assert min(each.rect["x"] for each in page.browser.all("#chart .values span")) >= right  # where no curve is
+    page.browser.enter("#time", 0.97)
+    wait_for(lambda: page.is_at(0.9))  # the frame that is shown at this time
+    assert page.browser["time-told"].text == "frame 10 of 16, 0.90 / 1.50 s"
     page.browser["time"].send_keys(Keys.HOME)
     wait_for(lambda: page.is_at(0))
     for key, time_s in ((Keys.ARROW_RIGHT, 0.1), (Keys.ARROW_RIGHT, 0.2), (Keys.ARROW_LEFT, 0.1)):
@@ -269,8 +274,9 @@ def test_several_videos_are_ranked_as_by_the_command_line(page: Page) -> None:
     answer, told = compared(page, "success", "failure", "nothing")
     best_first = sorted(told["videos"], key=lambda video: video["rank"] or math.inf)
     assert page.browser.run("return [...document.querySelectorAll('#pairs li')].map((item) => item.textContent)") == [
-        (f"{video['rank']} {video['source']}" if video["rank"] else f"{video['source']}no rank")
-        + f"mean preference {video['wins']:.3f}"
+        f"#{video['rank']} {video['source']}mean preference {video['wins']:.3f}"
+        if video["rank"]
+        else f"{video['source']}no rank"
         for video in best_first
     ]
     widths = page.browser.run(
@@ -481,9 +487,11 @@ def test_a_slow_upload_shows_its_percentage_and_then_the_curve_and_a_slow_compar
         page.browser.driver.execute_cdp_cmd("Network.emulateNetworkConditions", link | {"offline": True})
         page.browser["compare"].click()
         page.browser.until("document.querySelector('#away .state')")
+        assert not page.browser["score"].is_enabled()
     finally:
         page.browser.driver.execute_cdp_cmd("Network.emulateNetworkConditions", link | {"uploadThroughput": -1})
     page.browser.until("!document.querySelector('#away .state')")
+    assert page.browser["score"].is_enabled()
     assert page.browser["errors"].text.startswith("The videos could not be compared")  # also when the server is back
     assert all("ERR_INTERNET_DISCONNECTED" in line for line in page.browser.complaints())
 

@@ -183,7 +183,7 @@ def test_the_table_and_the_histogram_have_the_numbers_of_the_labels_and_the_wors
     for name, episodes in expected.items():
         heads[name].click()
         assert page.episodes == episodes, name
-        (marked,) = page.browser.all("#episode-list [aria-sort]")
+        (marked,) = page.browser.all("#episode-list [aria-sort] button")
         assert marked.text.replace("\n", " ").rstrip(" ↑↓") == name
     Select(page.browser["order"]).select_by_visible_text("worst first")
     assert page.episodes == worst
@@ -523,6 +523,7 @@ def test_an_episode_is_scored_as_it_was_for_the_labels_and_one_without_labels_to
     assert [page.browser[name].is_displayed() for name in ("only-never", "cutoff", "others")] == [False] * 3
     command, copy = page.browser["no-labels"].text.splitlines()[-2:]
     assert (command.split(" --url ")[0], copy) == ("rfm-client label toy_v21", "Copy")
+    assert page.browser["warning"].text.startswith(TOY)  # of the model that would label it
     page.at_rest(1)
     assert page.numbers == []
     page.score_episode()

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Asks the gateway. Every error is an Error whose message reads `where: expected X, got Y`.
+// Asks the gateway. Every error that it answers is an Error whose message reads `where: expected X, got Y`.
 
 import { send } from "./upload.js";
 
@@ -105,7 +105,7 @@ async function answer(path, options = {}, ask = fetch) {
     response = await ask(path, { ...options, headers });
   } catch (error) {
     if (error.name === "AbortError") throw error;
-    throw new GatewayAway(`gateway: expected an answer, got none (${error.message})`);
+    throw new GatewayAway(`the server does not answer: try again when it is back (${error.message})`);
   }
   if (response.ok) return response;
   const reason = await reasonOf(response);

@@ -10,7 +10,7 @@ import uPlot from "./uplot/uPlot.esm.js";
 export const NUM_COLOURS = 12;
 const LEFT_PX = 60; // of the numbers and names to the left
 const VALUE_PX = 16; // height of a number beside the chart
-const RIGHT_PX = 64; // of the numbers at the end; of several curves each with a piece of its line
+const RIGHT_PX = 64; // of the numbers to the right; of several curves each with a piece of its line
 const STUB_PX = 12; // length of such a piece
 const MOST_VALUES = 6; // of more curves those of one colour have numbers
 export const MARK_PX = 72; // at least between the marks of the axis below
@@ -23,7 +23,7 @@ const LOW_WITH_SUCCESS = { leading: [0.46, 0.98], success: [0.03, 0.36] };
 const WITHOUT_SUCCESS = { leading: [0.03, 0.98] };
 const HALVING_PX = 200; // turns of the wheel that halve the time that is shown
 const MOST_ZOOM = 500;
-const [GAP, LOW_GAP] = [0.06, 0.12]; // of the height, between progress and what other models predict in place of it
+const [GAP, LOW_GAP] = [0.06, 0.12]; // of the height, between progress and what other models predict in place of it; half of it is room for a name
 
 /** The name of the colour of curve number `index`, which the style sheet has for each theme. */
 export function colourName(index) {
@@ -67,12 +67,14 @@ export function heightOf(panes, signal, value) {
  * A chart in `host`. `onTime(seconds, isDragged)` is called when somebody points at it or drags in it.
  * onThreshold(value): somebody drags the line at which success counts
  * onView(view): somebody zooms or pans, as `look` takes it
+ * onChosen(labels): of many curves, these have numbers; of few curves none is named
  */
 export class Chart {
   #host;
   #onTime;
   #onThreshold;
   #onView;
+  #onChosen;
   #plot = null;
   #curves = [];
   #panes = panesOf([]);
@@ -88,11 +90,12 @@ export class Chart {
   #dots = made("dots");
   #resizing = new ResizeObserver(() => this.#host.clientWidth && this.#plot?.setSize(this.#size()));
 
-  constructor(host, onTime, { onThreshold = null, onView = () => {} } = {}) {
+  constructor(host, onTime, { onThreshold = null, onView = () => {}, onChosen = () => {} } = {}) {
     this.#host = host;
     this.#onTime = onTime;
     this.#onThreshold = onThreshold;
     this.#onView = onView;
+    this.#onChosen = onChosen;
     this.#line.classList.toggle("movable", onThreshold !== null);
     this.#resizing.observe(host);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.redraw());
@@ -151,12 +154,12 @@ export class Chart {
     const left = this.#plot.valToPos(seconds, "x");
     const isHidden = !Number.isFinite(left) || left < 0 || left > width + 1;
     this.#playhead.hidden = this.#values.hidden = this.#dots.hidden = isHidden;
-    this.#playhead.style.transform = this.#values.style.transform = `translateX(${left}px)`;
+    this.#playhead.style.transform = `translateX(${left}px)`;
     if (isHidden) return;
     this.#showValues(seconds);
   }
 
-  /** Writes the number of each curve to the right of the vertical line, at the height of its line if there is room. */
+  /** Writes the number of each curve to the right of the chart, where no line is, at the height of its point if there is room. */
   #showValues(seconds) {
     const points = Object.keys(this.#panes).flatMap((signal) => this.#curves.map((curve) => {
       const index = pointAt(curve.times, seconds);
@@ -164,8 +167,8 @@ export class Chart {
     })).filter(({ value }) => value !== null && value !== undefined);
     for (const point of points) point.top = this.#top(point.signal, point.value);
     const chosen = this.#chosen(points);
-    const named = chosen.length < points.length ? chosen : [];
-    this.#dots.replaceChildren(...points.map((point) => this.#dot(point, named.includes(point))).reverse()); // as the lines: the first one on top
+    this.#onChosen(chosen.length < points.length ? chosen.map(({ curve }) => curve.label) : []);
+    this.#dots.replaceChildren(...points.map((point) => this.#dot(point)).reverse()); // as the lines: the first one on top
     const ordered = Object.values(this.#panes); // from above
     const gap = Math.min(...ordered.slice(1).map(({ to }, place) => ordered[place].from - to)) * this.#plot.over.clientHeight;
     const beyond = Math.min(VALUE_PX, gap - VALUE_PX) / 2; // of its pane, so that no number hides one of another pane
@@ -198,10 +201,9 @@ export class Chart {
     return this.#curves.length > 1;
   }
 
-  /** The point of a curve that a number tells. isNamed: of many curves, this has a number */
-  #dot({ curve, time, top }, isNamed) {
+  /** The point of a curve. */
+  #dot({ curve, time, top }) {
     const element = document.createElement("i");
-    if (isNamed) element.dataset.name = curve.label;
     element.style.background = colourOf(curve);
     element.style.transform = `translate(${this.#plot.valToPos(time, "x").toFixed(1)}px, ${top.toFixed(1)}px)`;
     return element;
@@ -342,7 +344,7 @@ function drawNames({ ctx, bbox }, panes, letterPx) {
     ctx.save();
     ctx.translate(bbox.left - (LEFT_PX - 2) * scale, bbox.top + (1 - (from + to) / 2) * bbox.height);
     ctx.rotate(-Math.PI / 2);
-    if ((to - from) * bbox.height > ctx.measureText(title).width) ctx.fillText(title, 0, 8 * scale);
+    if ((to - from + LOW_GAP) * bbox.height > ctx.measureText(title).width) ctx.fillText(title, 0, 8 * scale);
     ctx.restore();
   }
   ctx.restore();

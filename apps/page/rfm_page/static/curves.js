@@ -49,8 +49,8 @@ export class Curve {
   }
 
   get sampling() {
-    const frames = this.sampledFrames === null ? [] : [`up to ${this.sampledFrames} frames`];
-    return [this.rule, ...frames, ...corrections(this)].join(", ");
+    const frames = this.sampledFrames === null ? "" : `: up to ${this.sampledFrames} of the frames so far`;
+    return [`${this.rule}${frames}`, ...corrections(this)].join(", ");
   }
 
   get name() {

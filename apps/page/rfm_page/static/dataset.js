@@ -82,7 +82,10 @@ export class DatasetTab {
       videos: page["episode-videos"], chart: page["episode-chart"], motion: page["motion-chart"], slider: page["episode-time"],
       button: page["episode-play"], told: page["episode-time-told"],
     };
-    this.#timeline = new Timeline(elements, { onThreshold: (value) => { this.#cutAt(value); this.#onShown(false); } });
+    this.#timeline = new Timeline(elements, {
+      onThreshold: (value) => { this.#cutAt(value); this.#onShown(false); },
+      onChosen: (labels) => { for (const item of page["motion-legend"].children) item.classList.toggle("chosen", labels.includes(item.textContent)); },
+    });
     this.#listen();
   }
 
@@ -484,8 +487,8 @@ export class DatasetTab {
     const rows = {
       Checkpoint: checkpoint && [checkpoint.source ?? checkpoint.weights_digest, checkpoint.revision].filter(Boolean).join("@"),
       Sampling: sampling && [sampling.rule, sampling.frames && `${sampling.frames} frames`].filter(Boolean).join(", "),
-      Mode: mode,
-      Cameras: cameras && `${cameras.map(short).join(", ")}${cameras.length > 1 ? `; ${fuse}` : ""}`,
+      Mode: mode && { prefix: "prefix: a frame is scored with those before it", whole: "whole: all frames are scored together" }[mode],
+      Cameras: cameras && `${cameras.map(short).join(", ")}${cameras.length > 1 ? `; the label is their ${fuse}` : ""}`,
       Turned: byCamera(orientations),
       Channels: byCamera(channels),
       "Written by": writer,
@@ -504,7 +507,6 @@ export class DatasetTab {
     this.#page.episode.hidden = true;
     this.#page.datasets.classList.remove("watching");
     for (const name of ["score-episode", "episode-png", "episode-svg"]) this.#page[name].disabled = true;
-    this.#page["episode-png"].title = this.#page["episode-svg"].title = "Open an episode";
     this.#table.mark(null, []);
   }
 
@@ -579,7 +581,6 @@ export class DatasetTab {
     page["episode-chart"].setAttribute("aria-label", describe(curves));
     Object.assign(this.#watched, { fps: told[0].fps, curves });
     page["episode-png"].disabled = page["episode-svg"].disabled = !curves.length;
-    page["episode-png"].title = page["episode-svg"].title = curves.length ? "" : "This episode has no labels";
     const found = await Promise.all(cameras.map((_, camera) => videoOf(this.#number, episode, camera, signal)));
     if (signal.aborted) return;
     if (!cameras.length) this.#places.episode.show(noVideo(() => this.#watch(this.#watched)));

@@ -34,7 +34,8 @@ export class Histogram {
     const undone = (bin) => ever[bin] > good[bin] ? ` and ${ever[bin] - good[bin]} succeed but undo it` : "";
     const told = edges.map((edge, bin) => `${all[bin]} from ${edge.toFixed(2)}${ever[bin] ? ` of which ${good[bin]} succeed${undone(bin)}` : ""}`);
     this.#host.setAttribute("aria-label", `Episodes by final progress: ${told.join(", ")}`);
-    const data = [edges, all, ever, good];
+    const beyond = (counts, least) => counts.map((count, bin) => (count > least[bin] ? count : null)); // of a bar that another hides, a fringe would be seen
+    const data = [edges, beyond(all, ever), beyond(ever, good), good];
     if (this.#plot) this.#plot.setData(data);
     else this.#plot = this.#newPlot(data);
   }

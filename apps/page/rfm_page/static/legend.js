@@ -6,8 +6,9 @@ import { failedOf, questionsOf } from "./curves.js";
 import { byQuestion } from "./looks.js";
 import { nameable, remover } from "./nameable.js";
 import { sampleOf } from "./svg.js";
+import { cut } from "./text.js";
 
-const NAME_LETTERS = 48;
+const [NAME_LETTERS, ERROR_LETTERS] = [48, 120];
 
 export class Legend {
   #host;
@@ -43,8 +44,9 @@ export class Legend {
       colour.setAttribute("aria-label", `Colour of ${question.name}`);
       line.style.color = isByQuestion ? colourOf(first) : "";
       line.replaceChildren(sampleOf(first.dash));
-      trouble.textContent = failedOf(question.curves);
-      line.hidden = trouble.textContent === "failed"; // no line is drawn
+      const failed = failedOf(question.curves);
+      trouble.textContent = failed === "failed" ? `failed: ${cut(first.error, ERROR_LETTERS)}` : failed;
+      line.hidden = failed === "failed"; // no line is drawn
       colour.hidden = line.hidden || !isByQuestion;
       name.show(question.name, `${first.task} (${first.model}, ${first.sampling})`, NAME_LETTERS);
       away.setAttribute("aria-label", `Remove the curves of ${question.name}`);

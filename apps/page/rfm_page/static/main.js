@@ -73,6 +73,7 @@ async function askServer(isCurrent) {
   useRemedies(about.remedies, about.url);
   places.away.clear();
   page["key-form"].hidden = true;
+  showWhetherReady();
   datasetTab.begin();
   if (!gateway.models.length) askingModels.begin();
   return true;
@@ -85,7 +86,7 @@ function offer(about) {
   page.orient.replaceChildren(...gateway.orientations.map((name) => new Option(name === "none" ? "as stored" : name, name)));
   page.channels.replaceChildren(...gateway.channel_orders.map((name) => new Option(name.toUpperCase(), name)));
   videos.correct(correction());
-  page.fps.value = gateway.fps;
+  page.fps.value = page["usual-fps"].textContent = gateway.fps;
 }
 
 /** Asks which models are served, and offers them. Says whether there is one. */
@@ -126,6 +127,7 @@ function showAnywhere(error) {
   } else if (error instanceof GatewayAway) {
     places.away.show(serverAway(error, begin));
     places.served.clear();
+    showWhetherReady();
   } else return false;
   return true;
 }
@@ -209,9 +211,9 @@ function tasks() {
 function showWhetherReady() {
   const isTaskThere = tasks().length > 0;
   if (isTaskThere || !videos.all.length) page["task-wanted"].textContent = "";
-  page.score.disabled = !videos.all.length || !isTaskThere || !page.model.value;
+  page.score.disabled = !videos.all.length || !isTaskThere || !page.model.value || !places.away.isEmpty;
   const missing = [!videos.all.length && "a video", !isTaskThere && "a task"].filter(Boolean).join(" and ");
-  page.score.title = !page.score.disabled ? "" : missing ? `Add ${missing}` : "No model is served";
+  page.score.title = !page.score.disabled ? "" : missing ? `Add ${missing}` : places.away.isEmpty ? "No model is served" : "The server does not answer";
 }
 
 function form(fields, files) {

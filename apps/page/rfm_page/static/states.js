@@ -14,8 +14,9 @@ export class Place {
     this.#host = host;
   }
 
+  /** Whether nothing is told here, not even in a bar that somebody has closed. */
   get isEmpty() {
-    return !this.#host.hasChildNodes();
+    return !this.#host.dataset.told;
   }
 
   /**

@@ -13,7 +13,7 @@ const NEAR_S = 1e-3;
 /**
  * elements: `videos`, `chart` and perhaps `motion` hold what is shown, `slider` is an input, `button` plays and pauses,
  * `told` says the time
- * changing: of the videos, as `Videos` takes it; chartOptions: as `Chart` takes them
+ * changing: of the videos, as `Videos` takes it; onChosen: of the chart of motion, and chartOptions: as `Chart` takes them
  */
 export class Timeline {
   #slider;
@@ -24,11 +24,11 @@ export class Timeline {
   #charts;
   time = 0;
 
-  constructor({ videos, chart, motion = null, slider, button, told }, { changing = null, ...chartOptions } = {}) {
+  constructor({ videos, chart, motion = null, slider, button, told }, { changing = null, onChosen, ...chartOptions } = {}) {
     this.videos = new Videos(videos, (seconds, video) => this.moveTo(seconds, video), changing);
     const onView = (view) => { for (const each of this.#charts) each.look(view); };
     this.#charts = [chart, motion].filter(Boolean).map((host, place) =>
-      new Chart(host, (seconds, isDragged) => this.#pointedAt(seconds, isDragged), place ? { onView } : { ...chartOptions, onView }));
+      new Chart(host, (seconds, isDragged) => this.#pointedAt(seconds, isDragged), place ? { onView, onChosen } : { ...chartOptions, onView }));
     [this.chart] = this.#charts;
     this.#slider = slider;
     this.#button = button;
@@ -54,21 +54,28 @@ export class Timeline {
   /** Moves everything to a time, but for the video that it comes from. */
   moveTo(seconds, from = null) {
     this.time = Math.min(seconds, Number(this.#slider.max));
-    if (!this.videos.isPlaying || !from) this.videos.seek(this.time, from);
+    if (!this.videos.isPlaying || !from) {
+      this.time = this.#at;
+      this.videos.seek(this.time, from);
+    }
     this.#showTime();
+  }
+
+  /** The time of the point that is shown: between two points there is no number. */
+  get #at() {
+    return this.#points[pointAt(this.#points, this.time)] ?? this.time;
   }
 
   #showTime() {
     this.#button.textContent = this.videos.isPlaying ? "Pause" : "Play";
     this.#button.classList.toggle("pauses", this.videos.isPlaying);
-    this.#slider.value = this.time;
+    const at = this.#at;
+    this.#slider.value = at;
     const { allTimes = [] } = this.#curves[0] ?? {};
     const isOneRate = this.#curves.every((curve) => curve.allTimes.length === allTimes.length); // else frames have several numbers
-    const frame = isOneRate ? `frame ${(pointAt(allTimes, this.time) ?? 0) + 1} of ${allTimes.length}, ` : "";
-    this.#told.textContent = this.#slider.disabled ? "" : `${frame}${this.time.toFixed(2)} / ${Number(this.#slider.max).toFixed(2)} s`;
-    this.#slider.setAttribute("aria-valuetext", [`${this.time.toFixed(2)} seconds`, ...this.#numbers()].join("; "));
-    const points = this.#points;
-    const at = points[pointAt(points, this.time)] ?? this.time; // between two points there is no number
+    const frame = isOneRate ? `frame ${(pointAt(allTimes, at) ?? 0) + 1} of ${allTimes.length}, ` : "";
+    this.#told.textContent = this.#slider.disabled ? "" : `${frame}${at.toFixed(2)} / ${Number(this.#slider.max).toFixed(2)} s`;
+    this.#slider.setAttribute("aria-valuetext", [`${at.toFixed(2)} seconds`, ...this.#numbers()].join("; "));
     for (const chart of this.#charts) chart.moveTo(at);
   }
 
@@ -91,7 +98,7 @@ export class Timeline {
     if (this.videos.isPlaying) {
       this.videos.pause();
     } else {
-      if (this.time >= Number(this.#slider.max)) this.moveTo(0);
+      if (this.time >= this.#points.at(-1)) this.moveTo(0);
       this.videos.play();
     }
     setTimeout(() => this.#showTime());

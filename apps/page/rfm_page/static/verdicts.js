@@ -35,7 +35,7 @@ export function addVerdict(host, verdict) {
   return box;
 }
 
-/** The videos, best first, then those without a rank: each with the mean probability of winning, as a bar if it has a rank. */
+/** The videos, best first, then those without a rank: each that has one with the mean probability of winning. */
 function rankingOf(videos, answer) {
   const list = document.createElement("ol");
   const ranked = videos.map((video, index) => ({ video, ...answer.videos[index] }));
@@ -43,7 +43,7 @@ function rankingOf(videos, answer) {
     const [item, place] = ["li", "span"].map((name) => document.createElement(name));
     place.className = rank ? "share" : "unranked";
     place.append(rank ? barOf(video, wins) : "no rank");
-    item.append(element("span", rank ? `${rank} ${video.title}` : video.title), place, element("span", `mean preference ${shown(wins)}`));
+    item.append(element("span", rank ? `#${rank} ${video.title}` : video.title), place, element("span", rank ? `mean preference ${shown(wins)}` : ""));
     list.append(item);
   }
   return list;
