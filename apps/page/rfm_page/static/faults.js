@@ -76,10 +76,11 @@ export function noEpisode(retry) {
 /** dataset: name and kind; needsTask: an episode has none */
 export function noLabels(dataset, needsTask) {
   const words = ["rfm-client", "label", ...datasetWords(dataset), ...serverOption(tritonUrl)].map(quoted);
+  const where = dataset.name.includes("/") ? "" : " in the folder that holds it"; // org/name: the Hub's
   return {
     kind: "empty",
     title: "No labels",
-    text: `Label this dataset${needsTask ? ", with what the robot does as the SENTENCE" : ""}, then reload the page:`,
+    text: `Label this dataset${where}${needsTask ? ", with what the robot does as the SENTENCE" : ""}, then reload the page:`,
     command: [...words, ...(needsTask ? ['--task "SENTENCE"'] : [])].join(" "),
   };
 }
