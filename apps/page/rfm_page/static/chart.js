@@ -156,6 +156,8 @@ export class Chart {
     this.#playhead.hidden = this.#values.hidden = this.#dots.hidden = isHidden;
     this.#playhead.style.transform = `translateX(${left}px)`;
     if (isHidden) return;
+    this.#values.dataset.at = `at ${seconds.toFixed(2)} s`;
+    this.#values.style.setProperty("--bottom", `${this.#plot.over.clientHeight + 12}px`);
     this.#showValues(seconds);
   }
 
