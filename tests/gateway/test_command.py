@@ -54,7 +54,7 @@ def test_an_open_address_without_a_key_is_warned_of(
     with caplog.at_level(logging.INFO, "rfm_gateway"):
         rfm("gateway", "--triton", NO_TRITON, "--host", "0.0.0.0", "--port", str(port), *options)
     warning = "0.0.0.0 is no loopback address, and no key is required: every host that reaches it can use it"
-    shown = "shows Triton's key for everyone who reaches it, since it asks for none: --api-key-file"
+    shown = "sends Triton's key on behalf of every caller, because it asks for no key itself: set --api-key-file"
     assert {warning, shown} & {*caplog.messages} == (set() if has_key else {warning, shown})
     assert f"look at rewards in the browser: http://127.0.0.1:{port}/" in caplog.messages
     assert KEY not in caplog.text

@@ -548,8 +548,8 @@ def test_the_figure_fits_a_column_of_a_paper_and_is_light(page: Page) -> None:
 
 MODULES = """
 const [named, done] = arguments;
-Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts"].map((name) => import(`/viewer/${name}.js`))).then(
-  ([{ cut }, { commands, serverOption, datasetWords }, { Curve }, { svgFigure }, { lerobotWords }, { sentenceOf }]) => {
+Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts", "chart"].map((name) => import(`/viewer/${name}.js`))).then(
+  ([{ cut }, { commands, serverOption, datasetWords }, { Curve }, { svgFigure }, { lerobotWords }, { sentenceOf }, { Chart }]) => {
     const settings = { task: "lift", model: "m", rule: "all", fps: 1 };
     const curve = new Curve({ title: "a.mp4", id: 1 }, settings);
     curve.take("video", { num_frames: 7, times_s: null });
@@ -572,7 +572,19 @@ Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts"].map(
     const origin = { dataset: "rec", kind: "videos", episode: 3, camera: "top", task: "lift", fps: 5 };
     const given = { ...settings, rule: "rint", fps: 5, orient: "none", channels: "rgb" };
     const lines = commands("grpc://triton:8001", [4, 8].map((sampledFrames) => ({ video: { origin }, ...given, sampledFrames })), []);
-    done([figure, names, servers, datasets, words, sentences, lines]);
+    const host = document.body.appendChild(Object.assign(document.createElement("div"), { style: "width: 600px; height: 400px" }));
+    const chosen = [];
+    const chart = new Chart(host, () => {}, { onChosen: (labels) => chosen.push(labels) });
+    chart.show([1, 1, 1, 1, 1, 1, 3].map((end, index) => ({
+      label: `${index}`, colour: end === 3 ? "red" : "blue", times: [0, end], allTimes: [0, end],
+      progress: [0, end === 3 ? 0 : 1], success: [null, null],
+    })));
+    setTimeout(() => { // uPlot draws later
+      chart.moveTo(2.5);
+      chosen.push([...host.querySelectorAll(".values span")].map(({ dataset }) => dataset.curve));
+      host.remove();
+      done([figure, names, servers, datasets, words, sentences, lines, chosen.slice(-2)]);
+    });
   });
 """
 
@@ -580,7 +592,7 @@ Promise.all(["text", "takeaway", "curves", "figure", "exports", "verdicts"].map(
 def test_modules_cut_names_name_a_reachable_triton_and_lead_a_line_over_skipped_frames(page: Page) -> None:
     """Of seven frames the model skips three, and the score of one is missing."""
     dataset = "Ann's set; touch \n$(touch x)"
-    markup, names, servers, datasets, words, sentences, lines = page.browser.driver.execute_async_script(
+    markup, names, servers, datasets, words, sentences, lines, chosen = page.browser.driver.execute_async_script(
         MODULES, dataset
     )
     assert names == ["rollout_seed…100k.mp4", "success.mp4"]
@@ -595,6 +607,7 @@ def test_modules_cut_names_name_a_reachable_triton_and_lead_a_line_over_skipped_
     ]
     folders = [re.findall(r"--frames (\d) --output (\S+)", line) for line in lines.splitlines()]
     assert folders == [[("4", "rec_episode_3")], [("8", "rec_episode_3_2")]]
+    assert chosen == [["6"], ["6"]]  # of seven curves, the only one that has not ended
     svg = ElementTree.fromstring(markup)
     assert [len(line.attrib["points"].split()) for line in svg.iter(f"{SVG}polyline")] == [2, 1]
     assert "\N{MINUS SIGN}0.5" in texts(svg)  # the axis reaches the score below 0

@@ -65,7 +65,9 @@ def gateway(config: GatewayOptions) -> None:
         open_to_all = "%s is no loopback address, and no key is required: every host that reaches it can use it"
         logger.warning(open_to_all, address.host)
     if api_key is None and config.triton_api_key_file is not None:
-        logger.warning("shows Triton's key for everyone who reaches it, since it asks for none: --api-key-file")
+        logger.warning(
+            "sends Triton's key on behalf of every caller, because it asks for no key itself: set --api-key-file"
+        )
     logger.info("answers requests at %s", page_link(config))
     if page_of(config) is not None:
         logger.info("look at rewards in the browser: %s", page_link(config))

@@ -93,7 +93,14 @@ def _print_tables(comparison: LabelComparison) -> None:
     known, rows = comparison.is_success, []
     columns = ["labels", "VOC rho", "VOC tau", "no VOC", "final", "falls"]
     if known is not None:
-        columns[5:5] = ["of successes", "of failures", "AUROC success", "AUROC progress", "threshold", "balanced accuracy"]
+        columns[5:5] = [
+            "of successes",
+            "of failures",
+            "AUROC success",
+            "AUROC progress",
+            "threshold",
+            "balanced accuracy",
+        ]
     for each in comparison.evaluations:
         cells = [each.name, number(each.spearman), number(each.kendall), str(each.num_constant), number(each.final)]
         if known is not None:

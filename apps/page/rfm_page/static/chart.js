@@ -156,7 +156,6 @@ export class Chart {
     this.#playhead.hidden = this.#values.hidden = this.#dots.hidden = isHidden;
     this.#playhead.style.transform = `translateX(${left}px)`;
     if (isHidden) return;
-    this.#values.dataset.at = `at ${seconds.toFixed(2)} s`;
     this.#values.style.setProperty("--bottom", `${this.#plot.over.clientHeight + 12}px`);
     this.#showValues(seconds);
   }
@@ -168,7 +167,7 @@ export class Chart {
       return { curve, signal, time: curve.times[index], value: index === null ? null : curve[signal]?.[index] };
     })).filter(({ value }) => value !== null && value !== undefined);
     for (const point of points) point.top = this.#top(point.signal, point.value);
-    const chosen = this.#chosen(points);
+    const chosen = this.#chosen(points, seconds);
     this.#onChosen(chosen.length < points.length ? chosen.map(({ curve }) => curve.label) : []);
     this.#dots.replaceChildren(...points.map((point) => this.#dot(point)).reverse()); // as the lines: the first one on top
     const ordered = Object.values(this.#panes); // from above
@@ -191,10 +190,11 @@ export class Chart {
   }
 
   /** The points that have numbers: of many curves those of one colour, the one that the pointer is nearest to. */
-  #chosen(points) {
+  #chosen(points, seconds) {
     if (this.#curves.length <= MOST_VALUES || !points.length) return points;
     const distance = ({ top }) => Math.abs(top - this.#pointedTop);
-    const nearest = points.reduce((one, other) => (distance(other) < distance(one) ? other : one));
+    const here = points.filter(({ curve }) => curve.times[0] <= seconds && seconds <= curve.times.at(-1)); // others have ended
+    const nearest = (here.length ? here : points).reduce((one, other) => (distance(other) < distance(one) ? other : one));
     return points.filter(({ curve }) => colourOf(curve) === colourOf(nearest.curve));
   }
 

@@ -76,7 +76,8 @@ export function noEpisode(retry) {
 /** dataset: name and kind; needsTask: an episode has none */
 export function noLabels(dataset, needsTask) {
   const words = ["rfm-client", "label", ...datasetWords(dataset), ...serverOption(tritonUrl)].map(quoted);
-  const where = dataset.name.includes("/") ? "" : " in the folder that holds it"; // org/name: the Hub's
+  const isFolder = !dataset.name.includes("/") && !dataset.kind.startsWith("reader"); // not of the Hub; a reader has a path, too
+  const where = isFolder ? " in the folder that holds it" : "";
   return {
     kind: "empty",
     title: "No labels",
