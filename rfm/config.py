@@ -174,7 +174,9 @@ class ServeConfig(Settings):
     )
     grpc_key: Path | None = setting(None, "The certificate's key (PEM).")
     grpc_client_ca: Path | None = setting(None, "Require client certificates from these authorities (PEM) over gRPC.")
-    grpc_any_client: bool = setting(False, "Beyond loopback, too, let clients without a certificate use gRPC with TLS.")
+    grpc_any_client: bool = setting(
+        False, "Beyond loopback, too, let clients without a certificate or key use gRPC with TLS."
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -222,7 +222,8 @@ def serve(
         asked = config.serve
         is_open = asked.grpc_certificate is not None and found["gRPC"][1] == NO_KEY
         if is_open and not (asked.grpc_any_client or asked.is_loopback):
-            expected = f"client certificates (--grpc-client-ca) at {asked.host}, since TLS alone asks for nothing"
+            ways = f"client certificates (--grpc-client-ca) or a key (--api-key-file) at {asked.host}"
+            expected = f"{ways}, since TLS alone asks for nothing"
             fail(f"--grpc-certificate: expected {expected}, got none; --grpc-any-client serves everyone")
         screen = None
         if log is not None and sys.stderr.isatty():

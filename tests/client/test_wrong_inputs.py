@@ -138,7 +138,10 @@ FAILURES = {
         f"--grpc-certificate: {PAIR} key.pem and key.pem, got a file in another format",
     ),
     "rfm serve repository --host 10.0.0.5 --grpc-certificate key.pem --grpc-key key.pem": (
-        *(1, "--grpc-certificate: expected client certificates (--grpc-client-ca) at 10.0.0.5, "),
+        *(
+            1,
+            "--grpc-certificate: expected client certificates (--grpc-client-ca) or a key (--api-key-file) at 10.0.0.5, ",
+        ),
         "since TLS alone asks for nothing, got none; --grpc-any-client serves everyone",
     ),
     "rfm serve repository --gateway-port FREE_PORT --gateway-dataset nope": (
