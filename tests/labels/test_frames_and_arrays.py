@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -191,7 +192,11 @@ UNREAD: dict[str, tuple[list[str], str, str]] = {  # files, the opened path, the
     "HDF5 files in folders": (["a/x.hdf5"], "", "each a dataset of its own: rfm-client label takes the folder, open_"),
     "pictures": (["1.png", "2.png"], "", "got pictures outside of the folder of an episode"),
     "pictures of cameras": (["a/front/1.jpg"], "", "perhaps --videos '{episode}/front/*.jpg'; or write a reader"),
-    "a video in a deeper folder": (["a/b/episode_000000.mp4"], "", "perhaps --videos '{episode}.mp4'; or write"),
+    "a video in a deeper folder": (
+        ["a/b/episode_000000.mp4"],
+        "",
+        "--videos '{episode}.mp4' if each is an episode; or write",
+    ),
     "pictures and a video": (
         ["0/1.png", "a.mp4"],
         "",
@@ -250,9 +255,16 @@ def test_files_cloned_without_git_lfs_are_refused_with_the_command_that_fetches_
         label(open_dataset(root / name if name.endswith("5") else root, task=TASK), BrightnessScorer(), LabelOptions())
 
 
-@pytest.mark.parametrize("name", ["/nothing/here", "no dataset"])
-def test_a_missing_dataset_is_refused(name: str) -> None:
-    with pytest.raises(DatasetError, match=f"^{name}: expected a LeRobot dataset .* got none$"):
+@pytest.mark.parametrize(
+    ("name", "got"),
+    [
+        ("/nothing/here", "none: there is no /nothing/here"),
+        ("no dataset", f"none: there is no {Path.cwd()}/no dataset"),
+        ("hf://datasets/onlyone", "another address"),
+    ],
+)
+def test_a_missing_dataset_is_refused(name: str, got: str) -> None:
+    with pytest.raises(DatasetError, match=f"^{name}: expected a LeRobot dataset .* got {re.escape(got)}$"):
         open_dataset(name)
 
 

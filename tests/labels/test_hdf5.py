@@ -112,12 +112,6 @@ def test_pictures_are_turned_as_the_file_says_or_as_the_caller_says(
 CAMERA = "data/demo_0/obs/agentview_rgb"
 
 
-def test_transposed_pictures_of_the_same_bytes_are_others(tmp_path: Path) -> None:
-    shapes = (FRAMES, FRAMES.reshape(NUM_FRAMES, 24, 16, 3))
-    datasets = [open_dataset(write(tmp_path / f"{n}.hdf5", {}, {"top": each})) for n, each in enumerate(shapes)]
-    assert len({dataset.identity(dataset.episode(0), "top") for dataset in datasets}) == 2
-
-
 def test_external_storage_without_its_file_is_an_error(tmp_path: Path) -> None:
     file = write(tmp_path / "demos.hdf5", LIBERO, pictures())
     with h5py.File(file, "r+") as opened:

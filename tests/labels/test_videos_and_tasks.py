@@ -63,9 +63,12 @@ def test_videos_missing_from_the_table_are_listed(videos: Path, output: Path) ->
     label(open_dataset(videos), BrightnessScorer(), LabelOptions(output=output), notes)
     line = "tasks.csv leaves out videos beside it, which get no labels: b.mp4, day/c.mp4"
     assert [each for each in notes.lines if "tasks.csv" in each] == [line]
-    listed = f"{videos.absolute()}/b.mp4,a b\nday/a.mp4,open the box\nday/c.mp4,c d\n"
-    (videos / "tasks.csv").write_text(f"video,task\n{listed}")
-    assert not open_dataset(videos).notes
+    (videos.parent / "link").symlink_to(videos)
+    names = [f"{videos.parent}/link/b.mp4", f"{videos}/day/a.mp4", "day/c.mp4"]
+    (videos / "tasks.csv").write_text("".join(f"{each}\n" for each in ("video,task", *(f"{n},a b" for n in names))))
+    dataset = open_dataset(videos)
+    assert not dataset.notes
+    assert [each.name for each in dataset.episodes] == names
 
 
 def test_videos_in_deeper_folders_get_a_note_if_there_is_no_table(videos: Path) -> None:

@@ -632,6 +632,24 @@ def test_an_episode_that_is_recorded_later_is_listed(
         assert (preview["name"], preview["num_frames"]) == (new["name"], new["num_frames"])
 
 
+def test_an_episode_that_is_recorded_while_the_dataset_is_opened_is_listed(tmp_path: Path) -> None:
+    recorded = '    if not (folder / "new.mp4").exists():\n        (folder / "new.mp4").write_bytes(b"later")\n'
+    (tmp_path / "reader.py").write_text(READER.replace("return", "found =") + recorded + "    return found\n")
+    (dataset,) = open_to_show(f"{tmp_path}/reader.py:episodes={folder_of_videos(tmp_path)}")
+    assert [len(each.numbers) for each in (dataset, dataset.as_now())] == [2, 3]
+
+
+def test_a_dataset_stays_listed_while_a_file_is_unfinished(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    root = copied("toy_v30_many", tmp_path)
+    file = root / "meta" / "episodes" / "chunk-000" / "file-001.parquet"
+    with serving(root) as get:
+        before = get("/0").json()
+        with parquet.ParquetWriter(file, parquet.read_schema(file.with_name("file-000.parquet"))):
+            assert [get("/0").json() for _ in range(2)] == [before] * 2
+    assert caplog.text.count("showing the dataset as it was") == 1
+    assert f"{file}: expected a readable Parquet file" in caplog.text
+
+
 def test_tasks_are_those_of_the_reader_or_of_the_table_that_was_opened(tmp_path: Path) -> None:
     reader, folder = at_another_rate(tmp_path).split("=")
     other = Path(folder) / "other.csv"

@@ -6,10 +6,12 @@ T frames per episode, H x W pixels.
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -34,6 +36,9 @@ _BOUNDS = re.compile(r"[\W\d_]+|(?<=[a-z])(?=[A-Z])")  # separates the words in 
 _CAMERA_PREFIX = "observation.images."
 SIGNALS_FOLDER = "reward_signals"  # label folder inside a dataset's folder
 SeveralTasks: TypeAlias = Literal["each", "first"]
+_CLOCKS_NS = 2 * 10**9  # what a file system's times may lag behind the clock
+
+logger = logging.getLogger("rfm_client")
 
 
 def word_of_no_colours(camera: str) -> str | None:
@@ -334,21 +339,37 @@ class Dataset(ABC):
         """Return an episode's name, also of one that cannot be read."""
         return f"episode {number}"
 
-    def follow(self, reopen: Callable[[], Dataset]) -> Dataset:
-        """Let ``as_now`` open the dataset again. Returns it."""
-        self._latest, self._reopen, self._marks = self, reopen, self._marks_now()
+    def follow(self, reopen: Callable[[], Dataset], since_ns: int) -> Dataset:
+        """Let ``as_now`` open the dataset again. Returns it.
+
+        since_ns: when opening began; changes since then may have been missed
+        """
+        self._latest, self._reopen, self._fault = self, reopen, ""
+        self._marks = [mark for mark in self._marks_now() if mark[1] < since_ns - _CLOCKS_NS]
         return self
 
     def as_now(self) -> Dataset:
-        """Return the dataset that ``follow`` prepared, opened again if ``listed_in`` changed. Raises DatasetError."""
+        """Return the dataset that ``follow`` prepared, opened again if ``listed_in`` changed.
+
+        If it cannot be opened, perhaps because a recorder writes to it, it stays as it was until it can.
+        """
         marks = self._marks_now()
         if marks != self._marks:
-            self._latest, self._marks = self._reopen(), marks
+            try:
+                self._latest, self._marks = self._reopen(), marks
+            except DatasetError as error:
+                if str(error) != self._fault:
+                    logger.warning("showing the dataset as it was: %s", error)
+                self._fault = str(error)
         return self._latest
 
     def _marks_now(self) -> list[tuple[str, int, int]]:
-        found = [(file, file.stat()) for file in self.listed_in() if file.exists()]
-        return [(str(file), status.st_ctime_ns, status.st_size) for file, status in found]
+        marks = []
+        for file in self.listed_in():
+            with suppress(FileNotFoundError):  # also of a file that was deleted since
+                status = file.stat()
+                marks.append((str(file), status.st_ctime_ns, status.st_size))
+        return marks
 
     def listed_in(self) -> Iterable[Path]:
         """Yield the files and folders that change when the dataset gets other episodes or tasks."""

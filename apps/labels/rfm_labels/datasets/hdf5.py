@@ -66,8 +66,7 @@ class _Pixels(Stored):
         return length - self._skipped
 
     def identity(self) -> str:
-        # Portrait pictures differ from transposed ones by a mark. Landscape ones have none, as in older labels.
-        return digest_of(frame.tobytes() + b"portrait" * (len(frame) > frame.shape[1]) for frame in self.frames())
+        return digest_of(frame.tobytes() for frame in self.frames())
 
     def frames(self) -> Iterator[UInt8Array]:
         with opened_hdf5(self._file) as opened:

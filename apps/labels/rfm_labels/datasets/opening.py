@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -116,7 +117,8 @@ def _on_hub(source: str | Path) -> HubFiles:
     """Return the files of a LeRobot dataset on the Hub. Raises DatasetError."""
     match = _HUB_ID.fullmatch(str(source))
     if match is None:
-        raise DatasetError.at(source, _LAYOUTS, f"none: there is no {Path(source).absolute()}")
+        got = "another address" if "://" in str(source) else f"none: there is no {Path(source).absolute()}"
+        raise DatasetError.at(source, _LAYOUTS, got)
     hub = HubFiles(match[1], match[2] or match[3])
     if not (hub.folder / INFO_FILE).is_file():
         got = (hub.folder.is_dir() and _unread(hub.folder)) or "none: hf download it, and name its folder"
@@ -132,7 +134,8 @@ def open_to_show(source: str) -> list[Dataset]:
     Accepts blank and outdated tasks. In a LeRobot dataset, a row shows the nearest frame, as a player does.
     ``Dataset.as_now`` returns the datasets as they are later.
     """
-    return [opening().follow(opening) for opening in _openings(source)]
+    since_ns = time.time_ns()
+    return [opening().follow(opening, since_ns) for opening in _openings(source)]
 
 
 def _openings(source: str) -> list[Callable[[], Dataset]]:
@@ -230,11 +233,14 @@ def _by_pattern(root: Path, pattern: str, task: TaskOverride, corrections: Asked
 
 def _unlisted(table: Path, kind: str, names: Collection[str]) -> list[str]:
     """The episodes that lie beside the table's but are not listed."""
-    beside = {table.parent, *((table.parent / name).parent for name in names)} if kind in _SUFFIXES else {table.parent}
+    listed = [table.parent / name for name in names]
+    beside = {table.parent, *(each.parent for each in listed)} if kind in _SUFFIXES else {table.parent}
     found = [folder / name for folder in sorted(beside) if folder.is_dir() for name in _found(folder).get(kind, ())]
     if kind == "folders of pictures":  # ``_found`` also has folders without pictures
         found = [each for each in found if any(_is_frame(file) for file in each.iterdir())]
-    return in_natural_order({Path(os.path.relpath(each, table.parent)).as_posix() for each in found} - set(names))
+    known = {each.parent.resolve() / each.name: each for each in found}  # the table may name a folder in several ways
+    gone = known.keys() - {each.parent.resolve() / each.name for each in listed}
+    return in_natural_order(Path(os.path.relpath(known[each], table.parent)).as_posix() for each in gone)
 
 
 def _notes(table: Path, kind: str, gone: Sequence[str]) -> list[str]:

@@ -70,9 +70,8 @@ def read_csv(table: Path) -> tuple[list[str], list[tuple[str, list[str]]]]:
 
 
 def _normal(root: Path, path: str) -> str:
-    """Remove the root, ``./``, outer spaces and Windows backslashes, so that equal paths compare equal."""
+    """Remove ``./``, outer spaces and Windows backslashes, so that equal paths compare equal."""
     path = path.strip()
     if "\\" in path and not (root / path).exists():
         path = path.replace("\\", "/")
-    path = os.path.normpath(path.removeprefix(f"{root.absolute()}{os.sep}"))
-    return PurePath(path).as_posix()
+    return PurePath(os.path.normpath(path)).as_posix()
