@@ -286,6 +286,17 @@ def test_one_of_several_servers_that_comes_back_with_another_checkpoint_is_repor
         wait_for(has_told)
 
 
+def test_after_a_lull_only_the_server_that_answers_is_described(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rfm_client.transport.servers.LULL_S", 0.0)
+    stands = [Stand("grpc://one:1"), Stand("grpc://other:1")]
+    with RewardClient("", transports=stands) as client:
+        client.model_info()
+        for _ in range(4):
+            client.progress(SEEN)
+    assert [stand.asked["infer"] for stand in stands] == [2, 2]
+    assert [stand.asked["model_info"] for stand in stands] == [3, 2]
+
+
 @pytest.mark.parametrize("num_servers", [1, 3])
 def test_a_call_under_which_two_processes_end_fails(num_servers: int) -> None:
     stands = [Stand(f"grpc://{number}:1") for number in range(num_servers)]

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import asyncio
 import gc
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, cast, get_args
+from unittest.mock import AsyncMock
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ import pytest
 import transports
 from engine_server import EngineServer
 from rfm_client import (
+    DeadlineExceededError,
     FrameSize,
     InferenceFailedError,
     InvalidSampleError,
@@ -327,6 +330,53 @@ def test_an_episode_may_name_the_only_checkpoint_that_may_score_it() -> None:
             got = r"rfm_frames \(weights weights-of-v2\)"
             with pytest.raises(InferenceFailedError, match=rf"^envs\[3\]: expected .* weights-of-v1, got {got}"):
                 episode.add(frames[1])
+
+
+def test_a_named_checkpoint_is_that_of_the_server_that_answers() -> None:
+    other = replace(V2, version=V1.version)
+    shelves, paid = [Shelf(has_encoder=False), Shelf(other, has_encoder=False, url="grpc://other:1")], []
+    with RewardClient("", transports=shelves) as client:
+        episode = client.episode(TASK, weights_digest="weights-of-v1")
+        for frame in video(126, 4):
+            with suppress(InferenceFailedError):
+                paid.append(episode.add(frame).progress)
+    assert [shelf.count for shelf in shelves] == [2, 2]
+    assert paid == [pytest.approx(V1.score)] * 2
+
+
+def test_a_server_that_no_longer_describes_its_checkpoint_may_not_score_for_a_named_one(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("rfm_client.transport.servers.LULL_S", 0.0)
+    frames, shelf = video(127, 3), Shelf(has_encoder=False)
+    with RewardClient("", transports=[shelf]) as client:
+        named, free = client.episode(TASK, weights_digest="weights-of-v1"), client.episode(TASK)
+        assert named.add(frames[0]).step == 0
+        monkeypatch.setattr(shelf, "model_info", AsyncMock(side_effect=DeadlineExceededError("no answer in time")))
+        with pytest.raises(InferenceFailedError, match="expected a checkpoint with weights weights-of-v1, got an unk"):
+            named.add(frames[1])
+        assert free.add(frames[1]).step == 0
+        assert caplog.text.count("cannot tell whether the checkpoint is the same as before: no answer in time") == 2
+        monkeypatch.undo()
+        assert named.add(frames[2]).step == 1
+
+
+@pytest.mark.parametrize(
+    "describe",
+    [lambda client: client.model_info(frames=True, refresh=True), RewardClient.model_infos],
+    ids=["model_info", "model_infos"],
+)
+def test_a_change_that_a_caller_s_own_question_shows_ends_the_episode(
+    describe: Callable[[RewardClient], object],
+) -> None:
+    frames, shelf = video(128, 2), Shelf(other=replace(V2, version=V1.version), has_encoder=False)
+    with RewardClient("", transports=[shelf]) as client:
+        episode = client.episode(TASK)
+        episode.add(frames[0])
+        shelf.after = 0
+        describe(client)
+        with pytest.raises(InferenceFailedError, match="reset the episode"):
+            episode.add(frames[1])
 
 
 def test_frames_are_resized_as_the_served_checkpoint_reads_them_by_now() -> None:

@@ -90,9 +90,8 @@ class StepScorer:
             steps.score(step, prefix, list(islice(outcomes, len(windows))), ms)
             for (steps, step), (prefix, windows) in zip(asked, shown, strict=True)
         ]
-        info = await self.model_info(call)  # another one if the checkpoint changed during the call
         for steps, _ in asked:
-            steps.check_checkpoint(info, self._scorer.changes)
+            steps.check_checkpoint(call.answered_by, self._scorer.changes)
         return scores
 
     async def in_turn(

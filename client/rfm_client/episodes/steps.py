@@ -141,15 +141,17 @@ class Steps:
         }
         return StepScore(float(fused.progress[-1]), float(fused.success[-1]), succeeded, step, ms, more)
 
-    def check_checkpoint(self, info: ModelInfo, changes: Sequence[str]) -> None:
-        """Raise InferenceFailedError if the checkpoint is not the one in the options, or changed after the first score.
+    def check_checkpoint(self, answered_by: Sequence[ModelInfo | None], changes: Sequence[str]) -> None:
+        """Raise InferenceFailedError if a checkpoint is not the one in the options, or changed after the first score.
 
+        answered_by: what the servers that answered say about their checkpoints; None: nothing
         changes: a line for each change that the client has seen
         """
         where, pinned = self._where or "episode", self.options.weights_digest
-        if pinned not in (None, info.weights_digest):
-            got = f"{info.source or info.name} (weights {info.weights_digest})"
-            raise InferenceFailedError(f"{where}: expected a checkpoint with weights {pinned}, got {got}")
+        for info in answered_by if pinned is not None else ():
+            if info is None or info.weights_digest != pinned:
+                got = f"{info.source or info.name} (weights {info.weights_digest})" if info else "an unknown one"
+                raise InferenceFailedError(f"{where}: expected a checkpoint with weights {pinned}, got {got}")
         if self._num_changes is None:
             self._num_changes = len(changes)
         if self._num_changes != len(changes):

@@ -31,7 +31,7 @@ from rfm_client.frames.fit_to_checkpoint import FittedSample, fitted, whole, wit
 from rfm_client.scoring.batching import groups, model_of, padded_bytes, parts
 from rfm_client.transport.calls import Answer
 from rfm_client.transport.limits import ConcurrencyLimiter, Deadline
-from rfm_client.transport.servers import Servers
+from rfm_client.transport.servers import KnownServer, Servers
 from rfm_client.transport.threads import off_loop
 
 _ID_BYTES = 8  # random bytes in a call's request ids
@@ -67,6 +67,7 @@ class Call:
     request_ids: yields an id for each request
     server: index of the server to ask first; None: the least busy
     checks_blank: True: warn about videos that show nothing
+    answered_by: for each answer, the description of the checkpoint that gave it; None: unknown
     """
 
     server: int | None = None
@@ -84,6 +85,7 @@ class Call:
         self.deadline = deadline
         self.request_ids = (f"{prefix}-{number}" for number in itertools.count(1))
         outputs = {wire.PROGRESS_LOGITS: "logits", wire.TIMING_MS: "timing"}
+        self.answered_by: list[ModelInfo | None] = []
         self.outputs = tuple(output for output, option in outputs.items() if options.get(option))
         self.subsample, self.resize = options.get("subsample", False), options.get("resize", False)
 
@@ -112,9 +114,7 @@ class SampleScorer:
         self._model = model
         self._servers = servers
         self._concurrency = concurrency
-        self._infos: dict[str, ModelInfo] = {}  # until another model version answers, or a lost server
-        self._returns = 0  # of servers, when the descriptions were last compared
-        self._comparing = asyncio.Lock()
+        self._infos: dict[str, ModelInfo] = {}  # the newest of any server
         self.changes: list[str] = []  # what each change of the checkpoint was; empty with several servers
         self._undescribed: set[str] = set()  # not asked about embeddings again, which they score without a description
         self._checks_lengths = True  # until a trajectory was too long
@@ -152,7 +152,7 @@ class SampleScorer:
         """Return the server's description of ``model``, from memory unless ``refresh``. Raises RewardError."""
         if refresh or model not in self._infos:
             try:
-                self._infos[model] = await self._servers.model_info(model, deadline)
+                self._remember(model, *await self._servers.model_info(model, deadline))
             except ModelNotFoundError:
                 self._infos.pop(model, None)
                 raise
@@ -165,8 +165,9 @@ class SampleScorer:
         except ModelNotFoundError:
             self._infos.pop(model, None)
             raise
-        self._infos[model] = infos[0]
-        return infos
+        for info, server in reversed(infos):
+            self._remember(model, info, server)
+        return [info for info, _ in infos]
 
     def tell_of_length(self, num_frames: int, info: ModelInfo) -> None:
         """Log the first trajectory that has more frames than in training. Its scores are unreliable."""
@@ -280,42 +281,48 @@ class SampleScorer:
         try:
             async with self._concurrency.room(num_bytes, call.deadline):
                 inputs = await off_loop(num_bytes, tensors)
-                answer = await self._servers.infer(
+                answer, server = await self._servers.infer(
                     model, inputs, outputs, call.deadline, request_id=request_id, first=call.server
                 )
         except RewardError as error:
             error.request_id = request_id
             raise
-        if self._may_differ(model, answer) or self._comparing.locked():
-            async with self._comparing:  # first tell of the change, then return the new checkpoint's answers
-                if self._may_differ(model, answer):
-                    await self._compare(self._infos[model], model, call.deadline)
+        if self._may_differ(model, answer, server) or server.describing.locked():
+            async with server.describing:  # first tell of the change, then return the new checkpoint's answers
+                if self._may_differ(model, answer, server):
+                    await self._compare(model, server, call.deadline)
+        call.answered_by.append(None if self._may_differ(model, answer, server) else server.infos.get(model))
         return answer
 
-    def _may_differ(self, model: str, answer: Answer) -> bool:
+    def _may_differ(self, model: str, answer: Answer, server: KnownServer) -> bool:
         """True if the checkpoint that answered may be another than the described one."""
-        known = self._infos.get(model)
+        known = server.infos.get(model)
         if known is None:
-            return False
+            return model in self._infos
         is_new = bool(known.versions) and answer.model_version not in known.versions
-        return is_new or self._servers.returns != self._returns
+        return is_new or model not in server.described
 
-    async def _compare(self, before: ModelInfo, model: str, deadline: Deadline) -> None:
-        """Describe the model again, forget the others' descriptions, and log a change of the checkpoint.
-
-        If no server describes it, the next answer asks again.
-        """
-        returns = self._servers.returns
+    async def _compare(self, model: str, server: KnownServer, deadline: Deadline) -> None:
+        """Have the server that answered describe the model. If it does not, its next answer asks again."""
+        described = server.described
         try:
-            infos = await self.model_infos(model, deadline)
+            info, _ = await self._servers.model_info(model, deadline, server)
         except RewardError as error:
-            self._infos[model] = before
             logger.warning("%s: cannot tell whether the checkpoint is the same as before: %s", model, error)
             return
-        self._returns, self._infos = returns, {model: infos[0]}
-        now = next((info for info in infos if info.weights_digest != before.weights_digest), None)
-        if now is not None:
-            told = [f"{info.source or info.name} (weights {info.weights_digest})" for info in (now, before)]
+        self._remember(model, info, server, described)
+
+    def _remember(self, model: str, info: ModelInfo, server: KnownServer, described: set[str] | None = None) -> None:
+        """Remember a server's description. If its checkpoint changed, log it and forget the other models'.
+
+        described: the server's set at the time of the question; None: its set by now
+        """
+        before = server.infos.get(model) or self._infos.get(model) or info
+        server.infos[model] = self._infos[model] = info
+        (server.described if described is None else described).add(model)
+        if info.weights_digest != before.weights_digest:
+            server.infos, self._infos = {model: info}, {model: info}
+            told = [f"{each.source or each.name} (weights {each.weights_digest})" for each in (info, before)]
             change = "another checkpoint, {} instead of {}".format(*told)
             logger.warning("%s: served by %s: scores do not mix", model, change)
             if len(self._servers) == 1:

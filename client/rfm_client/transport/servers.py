@@ -58,12 +58,15 @@ logger = logging.getLogger("rfm_client")
 
 
 class KnownServer:
-    """One of several servers: transport, load and failures.
+    """One of several servers: transport, load, failures and descriptions.
 
     failures: how often the server was left out since the last success
     answered_at_s: when it last answered (monotonic clock)
     lost_at_s: when the first request that is retried failed (monotonic clock); None: none since the last success
     comeback: ends when the server reports ready again; None: never left out
+    infos: its last descriptions, by model
+    described: models described since it may have restarted, which a failure or a lull shows
+    describing: held while an answer waits for a description
     """
 
     def __init__(self, transport: Transport) -> None:
@@ -74,6 +77,9 @@ class KnownServer:
         self.answered_at_s = math.inf
         self.lost_at_s: float | None = None
         self.comeback: asyncio.Task[None] | None = None
+        self.infos: dict[str, ModelInfo] = {}
+        self.described: set[str] = set()
+        self.describing = asyncio.Lock()
 
     @property
     def is_left_out(self) -> bool:
@@ -115,7 +121,6 @@ class Servers:
         self._servers = [KnownServer(transport) for transport in transports]
         self._retry = retry
         self._is_closed = False
-        self.returns = 0  # how often a server answered that may have restarted: after a failure or a lull
         self._answered: set[str] = set()  # models that any server has served
         self._moments = itertools.count(1)
 
@@ -139,8 +144,8 @@ class Servers:
         *,
         request_id: str,
         first: int | None = None,
-    ) -> Answer:
-        """Return the named ``outputs`` that ``model`` gives for ``inputs``. Raises RewardError.
+    ) -> tuple[Answer, KnownServer]:
+        """Return the named ``outputs`` that ``model`` gives for ``inputs``, and who answered. Raises RewardError.
 
         first: index of the server to ask; after a failure, the next in the list. None: the least busy
         """
@@ -150,23 +155,28 @@ class Servers:
 
         return await self._request(model, request, deadline, first)
 
-    async def model_info(self, model: str, deadline: Deadline) -> ModelInfo:
-        """Return a server's description of ``model``. Raises RewardError."""
-        return await self._request(model, lambda server, left_s: server.model_info(model, left_s), deadline)
+    async def model_info(
+        self, model: str, deadline: Deadline, only: KnownServer | None = None
+    ) -> tuple[ModelInfo, KnownServer]:
+        """Return a server's description of ``model``, and that server. Raises RewardError.
 
-    async def model_infos(self, model: str, deadline: Deadline) -> list[ModelInfo]:
+        only: the server to ask, once and for a short time; None: any
+        """
+        return await self._request(model, lambda server, left_s: server.model_info(model, left_s), deadline, only=only)
+
+    async def model_infos(self, model: str, deadline: Deadline) -> list[tuple[ModelInfo, KnownServer]]:
         """Return what every reachable server says about ``model``; the first may appear twice.
 
         Raises RewardError if no server answers.
         """
         infos = [await self.model_info(model, deadline)]  # waits until a server answers
         if len(self._servers) > 1:
-            others = [server.transport for server in self._servers if not server.is_left_out]
+            others = [server for server in self._servers if not server.is_left_out]
             left_s = deadline.remaining_s()
-            replies = await asyncio.gather(*(each.model_info(model, left_s) for each in others), return_exceptions=True)
-            for outcome in replies:
+            asked = (server.transport.model_info(model, left_s) for server in others)
+            for server, outcome in zip(others, await asyncio.gather(*asked, return_exceptions=True), strict=True):
                 if isinstance(outcome, ModelInfo):
-                    infos.append(outcome)
+                    infos.append((outcome, server))
                 elif not isinstance(outcome, RewardError):
                     raise outcome
         return infos
@@ -198,11 +208,18 @@ class Servers:
         await asyncio.gather(*(server.close() for server in self._servers))
 
     async def _request(
-        self, model: str, request: Request[Answered], deadline: Deadline, first: int | None = None
-    ) -> Answered:
+        self,
+        model: str,
+        request: Request[Answered],
+        deadline: Deadline,
+        first: int | None = None,
+        only: KnownServer | None = None,
+    ) -> tuple[Answered, KnownServer]:
         try:
             if self._is_closed:
                 raise ClientClosedError("this client is closed")
+            if only is not None:
+                return await request(only.transport, min(deadline.remaining_s(), PROBE_TIMEOUT_S)), only
             return await self._until_answered(model, request, deadline, first)
         except (asyncio.CancelledError, Exception) as error:
             clear_variables(error)
@@ -212,7 +229,7 @@ class Servers:
 
     async def _until_answered(
         self, model: str, request: Request[Answered], deadline: Deadline, first: int | None
-    ) -> Answered:
+    ) -> tuple[Answered, KnownServer]:
         """Run the loop that the module describes."""
         refusals: dict[KnownServer, RewardError] = {}
         failures: dict[KnownServer, ServerUnavailableError] = {}
@@ -260,7 +277,8 @@ class Servers:
                 if deadline.ends_within(0):  # the pause took longer than planned
                     raise
             else:
-                self.returns += server.failures > 0 or asked_at_s - server.answered_at_s > LULL_S
+                if server.failures > 0 or asked_at_s - server.answered_at_s > LULL_S:
+                    server.described = set()  # a new one: who waits for a description fills the old
                 server.failures, server.answered_at_s = 0, time.monotonic()
                 if server.lost_at_s is not None:
                     lost_s = time.monotonic() - server.lost_at_s
@@ -268,7 +286,7 @@ class Servers:
                     server.lost_at_s = None
                 for other, refusal in refusals.items():  # not before: if all refuse, no server is at fault
                     self._leave_out(other, model, refusal)
-                return answer
+                return answer, server
         raise min(refusals.values(), key=lambda error: isinstance(error, ModelNotFoundError))  # which says least
 
     async def _ask(self, server: KnownServer, model: str, request: Request[Answered], left_s: float) -> Answered:
