@@ -152,7 +152,9 @@ def error_of(status: str, message: str, bad_request: BadRequest) -> errors.Rewar
         return errors.InvalidSampleError.at(without["name"], *_OF_VIEWS)
     if PROCESS_ENDED in text and "Stub process" in text:
         return errors.ProcessEndedError(text)
-    if LOST_REGION in text or f"has {NO_VERSIONS}" in text:  # the sample is not at fault: a retry may succeed
+    if f"has {NO_VERSIONS}" in text:
+        return errors.ServerUnavailableError(f"{text}: the server stops, or loads the model")
+    if LOST_REGION in text:  # the sample is not at fault: a retry may succeed
         return errors.ServerUnavailableError(text)
     kind = _ERROR_OF.get(status, errors.InferenceFailedError)
     error = bad_request(text) if kind is errors.InvalidSampleError else kind(text)
