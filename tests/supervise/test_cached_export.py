@@ -257,8 +257,8 @@ LARGE = Found((), {"model.safetensors": 8_900_000_000})
 REFUSED = {
     "a disk": (0, 200, {"free": 8}, r"disk of .*: expected at least 8\.9 GB, got 8 GB free; make room, or set XDG"),
     "a GPU": (8, 200, {}, r"GPU memory: expected at least 8\.9 GB, got 8 GB free; --weights int8 halves them, or "),
-    "memory beside a GPU": (80, 12, {}, r"memory: expected at least 17.7 GB, got 12 GB free; use a machine"),
-    "memory beside a small GPU": (10, 30, {}, r"memory: expected at least 38.3 GB, got 30 GB free; use a mach"),
+    "memory beside a GPU": (80, 12, {}, r"memory: expected at least 17\.7 GB, got 12 GB free; use a machine"),
+    "memory beside a small GPU": (10, 30, {}, r"memory: expected at least 38\.3 GB, got 30 GB free; use a mach"),
     "nothing": (80, 20, {}, ""),
 }
 
